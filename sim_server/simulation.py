@@ -76,7 +76,7 @@ class Simulation:
         if self.holders and self.touch:
             self.holders.use_load(self.touch.force)
         elements = [e.elements for e in self.effects.values() if e.elements is not None]
-        self.system = System(self.world, elements)
+        self.system = System(self.world, [e.coupled for e in self.effects.values() if e.coupled is not None])
         matched = self._matched()
         self.shape = ShapeMatching(self.world, matched, solver.warp_level) if matched else None
         self.warped = {body.index for body in self.rotated_bodies() + matched}  # whose solve is in the material frame
@@ -339,7 +339,7 @@ def build_effects(scene: Scene, world: World) -> dict[str, Effect]:
     for name in sorted({n for o in scene.objects for n in o.effects}):
         variants: dict[str, list[tuple[Body, Any]]] = {}
         for body, params in world.with_effect(name):
-            variants.setdefault(params.variant, []).append((body, params))
+            variants.setdefault(params.variant_of(body.elements), []).append((body, params))
         for variant, listed in variants.items():
             built[name + variant] = effect(name).build(world, listed)
             built[name + variant].name = name

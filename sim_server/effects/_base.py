@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from sim_server.arrays import Float64, Int32
 from sim_server.backends.base import Launch, PendingUpdate
 from sim_server.backends.energies import ElementEnergies
+from sim_server.mechanics.clusters import PatchedCells
 from sim_server.mechanics.system import Stencil, System
 from sim_server.mechanics.world import Body, World
 from sim_server.scene import Scene
@@ -58,6 +59,16 @@ class Effect:
     elements: Int32 | None = None
     rotated: tuple[Body, ...] = ()
     elastic: Mapping[int, tuple[Float64, Float64]] = MappingProxyType({})
+
+    @property
+    def coupled(self) -> Int32 | PatchedCells | None:
+        """What the system is to have places for (`stencil` of the launches)."""
+        return self.elements
+
+    @property
+    def element_nodes(self) -> list[Int32]:
+        """One node of each item of its launches over elements, cells and patches, in their order."""
+        return [] if self.elements is None else [self.elements[:, 0]]
 
     @property
     def known_to_workers(self) -> bool:
@@ -116,16 +127,20 @@ class Effect:
         """Potential energies of its elements; None for an effect without."""
         return None
 
+    def all_energies(self) -> list[ElementEnergies]:
+        """`energies`, and others that are launched after them in this order."""
+        return [] if (elements := self.energies()) is None else [elements]
+
     def energy(self) -> float:
         """Potential energy of the present state [J]; 0 for an effect without one.
 
         NaN where an element has a deformation that its law does not define.
         """
-        elements = self.energies()
-        if elements is None:
-            return 0.0
-        elements.launch()
-        return float(elements.launch.fetch("energy").sum(dtype=float))
+        total = 0.0
+        for elements in self.all_energies():
+            elements.launch()
+            total += float(elements.launch.fetch("energy").sum(dtype=float))
+        return total
 
     def refusals(self) -> list[Refusal]:
         """Elements whose deformation the law does not define (e.g. J <= 0), by the time of the first occurrence.

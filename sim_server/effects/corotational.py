@@ -105,6 +105,9 @@ class Params(Regional):
         """Variant of the kernels: the end of their file name, after `corotational`."""
         return "_exact" if self.tangent == "exact" else "_qr" if self.rotation == "qr" else ""
 
+    def variant_of(self, elements: str) -> str:
+        return self.variant if elements == "linear" else f"{self.variant}_cells"
+
 
 class Corotational(Effect):
     """Elements of all bodies that list the effect in one of its variants, in the order of their first nodes.
@@ -220,8 +223,10 @@ def rotation_matrices(quaternion: NDArray[Any]) -> Float64:
     return np.stack(entries, axis=1).reshape(-1, 3, 3)
 
 
-def build(world: World, listed: list[tuple[Body, Any]]) -> Corotational:
+def build(world: World, listed: list[tuple[Body, Any]]) -> Effect:
     """The elements; raises InputError for an element in no region of young."""
-    if other := [body for body, _ in listed if body.elements != "linear"]:
-        raise InputError(f'object {other[0].name!r}: elements = "{other[0].elements}" cannot be built yet')
-    return Corotational(world, listed)
+    if listed[0][0].elements == "linear":
+        return Corotational(world, listed)
+    from sim_server.effects._cells import StrainCellElements  # scenes of linear elements alone need none of it
+
+    return StrainCellElements(world, listed, _constants)

@@ -2,8 +2,7 @@
 // Corotational linear tetrahedra with the tangent that includes the change of their rotations (formulas: corotational.py). What it
 // adds to the usual tangent, for corners a and b, is [g_a]x E [g_b]x^T with E = R (sum e / (2 mu) u u^T) R^T, one E per element.
 #define WIDE
-#include "corotational.cuh"
-#include "eigen3.cuh"
+#include "corotational_twist.cuh"
 
 struct CorotationalExactElements {
     int n;                               // elements
@@ -20,31 +19,15 @@ struct CorotationalExactElements {
     local* nodal_impulse;                // (n, 4, 3) out: h f_a + h (c + beta) (K v)_a [N s]
 };
 
-// sum e / (2 mu) u u^T over the twists, from S = R^T F; e is clamped at 0.
 INLINE local_mat3 twists(const local_mat3& S, local_number lambda, local_number mu) {
-    const local half = 0.5;
-    local_number h[6] = {S.m[4] + S.m[8], -half * (S.m[1] + S.m[3]), -half * (S.m[2] + S.m[6]),
-                         S.m[0] + S.m[8], -half * (S.m[5] + S.m[7]), S.m[0] + S.m[4]};
-    const local_number zero = local_number{}, one = zero + 1, least = zero + (local)1e-4;  // below, R is not unique
-    local_vec3 u[3] = {{one, zero, zero}, {zero, one, zero}, {zero, zero, one}};
-    eigen3(h, u);
-    local_number over = lambda / mu * (trace(S) - 3) - 2;  // of mu
-    local_mat3 E = {};
-    for (int k = 0; k < 3; ++k) {
-        local_number e = larger(1 + over / larger(h[k == 0 ? 0 : k == 1 ? 3 : 5], least), zero);
-        local_vec3 w = e * u[k];
-        E.m[0] += w.x * u[k].x; E.m[1] += w.x * u[k].y; E.m[2] += w.x * u[k].z;
-        E.m[4] += w.y * u[k].y; E.m[5] += w.y * u[k].z; E.m[8] += w.z * u[k].z;
-    }
-    return symmetric(E.m[0], E.m[1], E.m[2], E.m[4], E.m[5], E.m[8]);
+    return twists(S, lambda / mu * (trace(S) - 3) - 2);
 }
 
 // The stress of `hooke` and what E adds to it, which is of the spin of T.
 INLINE local_mat3 exact_stress(const local_mat3& S, const local_mat3& T, const local_mat3& E, local h, local_number k,
                                local_number lambda, local_number mu) {
     local_mat3 P = hooke(S, T, h, k, lambda, mu);
-    local_vec3 c = k * mu * mul(E, local_vec3{T.m[5] - T.m[7], T.m[6] - T.m[2], T.m[1] - T.m[3]});
-    P.m[1] += c.z; P.m[2] -= c.y; P.m[3] -= c.z; P.m[5] += c.x; P.m[6] += c.y; P.m[7] -= c.x;
+    add_spin_stress(P, T, E, k * mu);
     return P;
 }
 

@@ -21,8 +21,8 @@ class EnergyContributor(Protocol):
     def balance_arrays(self) -> dict[str, Float64]:
         """Arrays of it that the balance reads, by name."""
 
-    def energies(self) -> ElementEnergies | None:
-        """Potential energies of its elements, or None for an effect without any."""
+    def all_energies(self) -> list[ElementEnergies]:
+        """Potential energies of its elements, in the order in which they are launched."""
 
 
 def collected_energies(
@@ -41,6 +41,6 @@ def collected_energies(
     return Energies(
         starts=np.array([*(b.first for b in world.bodies), world.nodes], np.int32),
         mass=world.mass, free=world.free, x=world.x, v=world.v, before=before, still=still, gravity=gravity,
-        touch=arrays, elastic=[e for x in effects.values() if (e := x.energies()) is not None],
+        touch=arrays, elastic=[e for x in effects.values() for e in x.all_energies()],
         balance=balance, inertia=world.inertia, on_runaway=on_runaway,
     )  # fmt: skip

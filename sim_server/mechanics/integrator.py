@@ -89,9 +89,11 @@ class InitialWeights:
 
 
 class CouplesNodes(Protocol):
-    """An effect, as far as it couples nodes. elements (m, c): node numbers of the corners of its elements, or None."""
+    """An effect, as far as it couples nodes."""
 
-    elements: Int32 | None
+    @property
+    def element_nodes(self) -> list[Int32]:
+        """One node of each item of its launches over elements, cells and patches."""
 
 
 class Integrator:
@@ -255,8 +257,8 @@ class Integrator:
 
 
 def rows_of(effects: Sequence[CouplesNodes]) -> list[Int32]:
-    """Returns one corner of each element, per effect that has some."""
-    return [e.elements[:, 0] for e in effects if e.elements is not None]
+    """Returns one node of each element, cell or patch, per effect that has some."""
+    return [nodes for e in effects for nodes in e.element_nodes]
 
 
 def items_of_bodies(launch: Launch, starts: Int32, row: Int32, firsts: list[Int32], held: Int32) -> Int32 | None:
@@ -267,7 +269,8 @@ def items_of_bodies(launch: Launch, starts: Int32, row: Int32, firsts: list[Int3
     """
     if launch.domain == "nodes" and launch.items == starts[-1]:
         return starts
-    candidates = {"elements": firsts, "blocks": [row], "held": [held]}.get(launch.domain, [])
+    of_elements = dict.fromkeys(("cells", "patches", "elements", "corners"), firsts)
+    candidates = {**of_elements, "blocks": [row], "held": [held]}.get(launch.domain, [])
     found = [c for c in candidates if len(c) == launch.items]
     parts = [np.searchsorted(np.searchsorted(starts, c, "right"), np.arange(1, len(starts) + 1)) for c in found]
     same = bool(parts) and all(np.array_equal(p, parts[0]) for p in parts)

@@ -9,12 +9,15 @@ all in the world frame; kernels/nodes.cu (`rotate`) and kernels/rotate_blocks.cu
 frame, where the solve happens.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from sim_server.arrays import Float64, Int32, Int64
 from sim_server.backends.base import Launch
+from sim_server.mechanics import clusters
+from sim_server.mechanics.clusters import Couplings, PatchedCells
 from sim_server.mechanics.world import World
 
 
@@ -25,18 +28,25 @@ class Stencil:
     An element has c corners, 2 (a spring) or 4 (a tetrahedron).
     corner_start (nodes + 1,), corners: slots c e + a of the elements at each node.
     pair_start (blocks above the diagonal + 1,), pairs (k,): c^2 e + c a + b, the corners of e that couple in a block.
+
+    Of strain cells with any number of nodes (clusters.py) corners are their slots, pairs (k, 2) the slots that couple;
+    corner_owners, pair_owners: the cell of each; patches: the same of their patches.
     """
 
     corner_start: Int32
     corners: Int32
     pair_start: Int32
     pairs: Int32
+    corner_owners: Int32 | None = None
+    pair_owners: Int32 | None = None
+    patches: "Stencil | None" = None
 
 
 class System:
     """Pattern and arrays of A' and b' for a world and the elements of its effects.
 
-    elements: per effect, (m, c) node numbers of the elements that couple their corners, c = 2 or 4.
+    elements: per effect, (m, c) node numbers of the elements that couple their corners, c = 2 or 4, or strain cells and
+        their patches.
 
     moving (bodies,): 1 if a node of the body does not rest, so that the step is solved; set by `rotate`
         (kernels/nodes.cu) and cleared by the loop
@@ -49,17 +59,23 @@ class System:
         launches are made
     """
 
-    def __init__(self, world: World, elements: list[Int32]):
+    def __init__(self, world: World, elements: Sequence[Int32 | PatchedCells]):
         n = world.nodes
         self.world = world
-        couplings = [_couplings(e, world, n) for e in elements]
-        keys = np.unique(np.concatenate([np.zeros(0, np.int64), *(keys for keys, _ in couplings)]))
+        couplings = [_couplings(e, world, n) for e in elements if isinstance(e, np.ndarray)]
+        patched = [_patched(e, world) for e in elements if isinstance(e, PatchedCells)]
+        every = [keys for keys, _ in couplings] + [found[0] for pair in patched for found in pair]
+        keys = np.unique(np.concatenate([np.zeros(0, np.int64), *every]))
         rows, columns = (part.astype(np.int32) for part in np.divmod(keys, n))
         above = rows < n
         self.row, self.column = rows[above], columns[above]
         self.held_rows, self.held_columns = rows - np.int32(n), columns
         self._number(n)
-        self.stencils = [_stencil(e, c, n, keys) for e, c in zip(elements, couplings, strict=True)]
+        fixed, ragged = iter(couplings), iter(patched)
+        self.stencils = [
+            _patched_stencil(e, next(ragged), n, keys) if isinstance(e, PatchedCells)
+            else _stencil(e, next(fixed), n, keys) for e in elements
+        ]  # fmt: skip
 
         self.sums = np.zeros((len(keys), 3, 3))
         self.values = np.zeros((len(self.columns), 3, 3))
@@ -187,6 +203,17 @@ def _couplings(elements: Int32, world: World, n: int) -> tuple[Int64, Int32]:
                 keys.append((i[here].astype(np.int64) + n) * n + j[here])
                 pairs.append((element + np.int32(corners * a + b))[here])
     return np.concatenate(keys), np.concatenate(pairs)
+
+
+def _patched(elements: PatchedCells, world: World) -> tuple[Couplings, Couplings]:
+    return clusters.couplings(elements.cells, world), clusters.couplings(elements.patches, world)
+
+
+def _patched_stencil(
+    elements: PatchedCells, found: tuple[Couplings, Couplings], n: int, blocks: Int64
+) -> Stencil:  # fmt: skip
+    patches = Stencil(*clusters.places(elements.patches, found[1], n, blocks))
+    return Stencil(*clusters.places(elements.cells, found[0], n, blocks), patches)
 
 
 def _stencil(elements: Int32, couplings: tuple[Int64, Int32], n: int, blocks: Int64) -> Stencil:

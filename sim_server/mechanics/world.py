@@ -13,6 +13,7 @@ from sim_server.arrays import Float64, Int32
 from sim_server.backends.base import Backend
 from sim_server.errors import InputError
 from sim_server.mesh import Mesh, posed
+from sim_server.mesh.shape_functions import MASS_PARTS, quadratic_gradients
 from sim_server.mesh.surface import volumes
 from sim_server.scene import Scene, SceneObject
 from sim_server.scene.elements import Kind, kind_of_elements
@@ -55,9 +56,9 @@ class Body:
 
     @property
     def centroids(self) -> Float64:
-        """Centroids (m, 3) of the elements at rest, before the pose [m]."""
-        centroids: Float64 = self.mesh.rest[self.mesh.tets].mean(axis=1)
-        return centroids
+        """Centroids (m, 3) of the elements at rest, before the pose [m]; of a quadratic one for each of its eight tets,
+        which thus have the same constants."""
+        return self.mesh.centroids
 
 
 @dataclass(frozen=True)
@@ -236,12 +237,18 @@ class World:
 
 
 def _lumped(o: SceneObject, mesh: Mesh) -> Float64:
-    """Nodal masses [kg], (n,): a quarter of each adjacent element's, or all equal."""
-    volume = volumes(mesh.rest, mesh.tets)
+    """Nodal masses [kg], (n,): parts of each adjacent element's, a quarter of a linear one's, or all equal."""
+    if mesh.quadratic is None:
+        volume = volumes(mesh.rest, mesh.tets)
+    else:
+        volume = quadratic_gradients(mesh.rest, mesh.quadratic)[0].sum(axis=1)
     total = o.mass if o.mass is not None else (o.density or 0) * volume.sum()
     if not np.isfinite(total):
         raise InputError(f"object {o.name!r}: its mass is not finite")
     if o.masses == "equal":
         return np.full(len(mesh.rest), total / len(mesh.rest))
-    share = np.repeat(total * volume / volume.sum() / 4, 4)
-    return np.bincount(mesh.tets.ravel(), weights=share, minlength=len(mesh.rest)).astype(np.float64)
+    if mesh.quadratic is not None:
+        nodes, share = mesh.quadratic, (total * volume[:, None] / volume.sum() * MASS_PARTS).ravel()
+    else:
+        nodes, share = mesh.tets, np.repeat(total * volume / volume.sum() / 4, 4)
+    return np.bincount(nodes.ravel(), weights=share, minlength=len(mesh.rest)).astype(np.float64)

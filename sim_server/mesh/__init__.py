@@ -19,6 +19,8 @@ from sim_server.arrays import Float64, Int32
 from sim_server.errors import InputError
 from sim_server.mesh.cells import tetrahedra
 from sim_server.mesh.check import complaints, crowded_faces, indices
+from sim_server.mesh.check_quadratic import quadratic_complaints, wound
+from sim_server.mesh.quadratic import quadratic_cells_of, sub_tetrahedra, with_mid_nodes
 from sim_server.mesh.surface import volumes
 
 log = logging.getLogger(__name__)
@@ -32,12 +34,31 @@ class Mesh:
 
     rest: float64 (n, 3) [m]; tets: int32 (m, 4), positive volume once checked; name: for messages; dropped: number of
     nodes of the file that are left out, so that the others have other numbers than there.
+    quadratic: int32 (e, 10), elements with a node on each edge (order: quadratic.py), None for linear ones; the tets
+    are then eight of each element, one element's after another's.
     """
 
     rest: Float64
     tets: Int32
     name: str = "mesh"
     dropped: int = 0
+    quadratic: Int32 | None = None
+
+    @property
+    def centroids(self) -> Float64:
+        """Centroid of each tet [m], (m, 3); in a quadratic mesh that of the corners of its element."""
+        if self.quadratic is None:
+            linear: Float64 = self.rest[self.tets].mean(axis=1)
+            return linear
+        return np.repeat(self.rest[self.quadratic[:, :4]].mean(axis=1), 8, axis=0)
+
+    def with_mid_nodes(self) -> "Mesh":
+        """Returns the mesh with quadratic elements: a linear one gets a node in the middle of each edge, behind its
+        own nodes."""
+        if self.quadratic is not None:
+            return self
+        rest, quadratic = with_mid_nodes(self.rest, self.tets)
+        return replace(self, rest=rest, tets=sub_tetrahedra(rest, quadratic), quadratic=quadratic)
 
 
 def bar(cells: Sequence[int], size: Sequence[float], split: str = "mirrored") -> Mesh:
@@ -84,11 +105,12 @@ def _kuhn_paths(stride: NDArray[np.integer]) -> NDArray[np.integer]:
     return np.array(paths)
 
 
-def read(path: str | Path) -> Mesh:
+def read(path: str | Path, quadratic: bool = False) -> Mesh:
     """Reads the volume cells of a file in any format of meshio, as tetrahedra; unchecked, see `check`.
 
-    Quadratic cells are reduced to their corners; hexahedra, wedges and pyramids are split (cells.py). Triangles, lines
-    and points of the file are left out, and so are nodes without a cell; what was changed is logged in one line.
+    quadratic: keeps quadratic tetrahedra where all volume cells are such.
+    Other quadratic cells are reduced to their corners; hexahedra, wedges and pyramids are split (cells.py). Triangles,
+    lines and points of the file are left out, and so are nodes without a cell; what was changed is logged in one line.
     Raises InputError naming the file: missing, unreadable, unknown format, or cells that cannot be used.
     """
     path = Path(path)
@@ -98,21 +120,25 @@ def read(path: str | Path) -> Mesh:
     rest = np.asarray(data.points, dtype=np.float64)
     if rest.shape[1:] != (3,):
         raise InputError(f"mesh {path}: node coordinates have shape {rest.shape}: must be (n, 3)")
+    kept = quadratic_cells_of(rest, data.cells) if quadratic else None
     try:
-        tets, changed = tetrahedra(rest, data.cells)
+        cells, changed = kept or tetrahedra(rest, data.cells)
     except InputError as error:
         raise InputError(f"mesh {path}: {error}") from None
-    if wrong := indices(rest, tets):
+    if wrong := indices(rest, cells):
         raise InputError(f"mesh {path}: {wrong}")
     used = np.zeros(len(rest), dtype=bool)
-    used[tets] = True
+    used[cells] = True
     dropped = int((~used).sum())
     if dropped:
-        changed.append(f"{dropped} of {len(rest)} nodes dropped, which are no corner of a cell")
+        where = "which belong to no cell" if kept else "which are no corner of a cell"
+        changed.append(f"{dropped} of {len(rest)} nodes dropped, {where}")
     if changed:
         log.warning("mesh %s: %s", path, "; ".join(changed))
-    number = np.cumsum(used) - 1
-    return Mesh(rest[used], number[tets].astype(np.int32), path.name, dropped)
+    rest, numbered = rest[used], (np.cumsum(used) - 1)[cells].astype(np.int32)
+    if kept:
+        return Mesh(rest, sub_tetrahedra(rest, numbered), path.name, dropped, numbered)
+    return Mesh(rest, numbered, path.name, dropped)
 
 
 def meshio_read(path: Path, what: str = "mesh") -> Any:
@@ -136,9 +162,11 @@ def meshio_read(path: Path, what: str = "mesh") -> Any:
 def check(mesh: Mesh) -> Mesh:
     """Returns `mesh` with every tetrahedron wound to positive volume; logs how many were inverted.
 
-    Raises InputError that names the first nodes or tetrahedra concerned: not finite, out of range, flat, duplicate,
-    coincident or unused.
+    Raises InputError that names the first nodes or tetrahedra concerned (of a quadratic mesh: elements): not finite,
+    out of range, flat, duplicate, coincident, unused or curved too much.
     """
+    if mesh.quadratic is not None:
+        return _checked_quadratic(mesh, mesh.quadratic)
     if wrong := list(complaints(mesh.rest, mesh.tets)):
         raise InputError("\n".join(f"mesh {mesh.name}: {text}" for text in wrong))
     if odd := crowded_faces(mesh.rest, mesh.tets):
@@ -150,6 +178,17 @@ def check(mesh: Mesh) -> Mesh:
     tets[inverted] = tets[inverted][:, [0, 1, 3, 2]]
     log.warning("mesh %s: winding of %d of %d tets repaired", mesh.name, int(inverted.sum()), len(tets))
     return replace(mesh, tets=tets)
+
+
+def _checked_quadratic(mesh: Mesh, given: Int32) -> Mesh:
+    if wrong := list(quadratic_complaints(mesh.rest, given)):
+        raise InputError("\n".join(f"mesh {mesh.name}: {text}" for text in wrong))
+    if odd := crowded_faces(mesh.rest, given[:, :4]):
+        log.warning("mesh %s: %s", mesh.name, odd)
+    quadratic = wound(mesh.rest, given)
+    if inverted := int((quadratic != given).any(axis=1).sum()):
+        log.warning("mesh %s: winding of %d of %d elements repaired", mesh.name, inverted, len(given))
+    return replace(mesh, quadratic=quadratic, tets=sub_tetrahedra(mesh.rest, quadratic))
 
 
 def pose_matrix(rotate: ArrayLike) -> Float64:

@@ -42,24 +42,24 @@ def shapes(rest: Rest, tets: Tets) -> str | None:
 
 def coordinates(rest: Rest, tets: Tets) -> str | None:
     bad = np.flatnonzero(~np.isfinite(rest).all(axis=1))
-    return _named("node", bad, "coordinates are not finite", lambda i: _point(rest[i]))
+    return named("node", bad, "coordinates are not finite", lambda i: _point(rest[i]))
 
 
 def indices(rest: Rest, tets: Tets) -> str | None:
     bad = np.flatnonzero(((tets < 0) | (tets >= len(rest))).any(axis=1))
-    return _named("tet", bad, f"node numbers must be 0 to {len(rest) - 1}", lambda i: f"nodes {tets[i].tolist()}")
+    return named("tet", bad, f"node numbers must be 0 to {len(rest) - 1}", lambda i: f"nodes {tets[i].tolist()}")
 
 
 def repeated_corners(rest: Rest, tets: Tets) -> str | None:
     bad = np.flatnonzero((np.diff(np.sort(tets, axis=1), axis=1) == 0).any(axis=1))
-    return _named("tet", bad, "a node occurs twice in it", lambda i: f"nodes {tets[i].tolist()}")
+    return named("tet", bad, "a node occurs twice in it", lambda i: f"nodes {tets[i].tolist()}")
 
 
 def flat_tets(rest: Rest, tets: Tets) -> str | None:
     volume = np.abs(volumes(rest, tets))
     longest = np.max([np.linalg.norm(rest[tets[:, a]] - rest[tets[:, b]], axis=1) for a, b in EDGES], axis=0)
     bad = np.flatnonzero(~(volume > FLAT * longest**3))  # so written, NaN is flat too
-    return _named("tet", bad, "zero volume", lambda i: f"{volume[i]:.3g} m3 at a longest edge of {longest[i]:.3g} m")
+    return named("tet", bad, "zero volume", lambda i: f"{volume[i]:.3g} m3 at a longest edge of {longest[i]:.3g} m")
 
 
 def duplicate_tets(rest: Rest, tets: Tets) -> str | None:
@@ -67,7 +67,7 @@ def duplicate_tets(rest: Rest, tets: Tets) -> str | None:
     order = np.lexsort(corners.T)
     same = (np.diff(corners[order], axis=0) == 0).all(axis=1)
     bad = order[1:][same]
-    return _named("tet", np.sort(bad), "the same four nodes as an earlier tet", lambda i: f"nodes {tets[i].tolist()}")
+    return named("tet", np.sort(bad), "the same four nodes as an earlier tet", lambda i: f"nodes {tets[i].tolist()}")
 
 
 def duplicate_nodes(rest: Rest, tets: Tets) -> str | None:
@@ -82,13 +82,13 @@ def duplicate_nodes(rest: Rest, tets: Tets) -> str | None:
         a, b = neighbour[i].tolist()
         return f"with node {a if b == i else b} at {_point(rest[i])}"
 
-    return _named("node", bad, "coincides with another node", other)
+    return named("node", bad, "coincides with another node", other)
 
 
 def unused_nodes(rest: Rest, tets: Tets) -> str | None:
     bad = np.flatnonzero(np.bincount(tets.ravel(), minlength=len(rest)) == 0)
     reason = "belongs to no tetrahedron (meshio: mesh.remove_orphaned_nodes())"
-    return _named("node", bad, reason, lambda i: f"at {_point(rest[i])}")
+    return named("node", bad, reason, lambda i: f"at {_point(rest[i])}")
 
 
 def crowded_faces(rest: Rest, tets: Tets) -> str | None:
@@ -105,7 +105,8 @@ def _point(x: Float64) -> str:
     return "(" + ", ".join(f"{c:.6g}" for c in x) + ")"
 
 
-def _named(what: str, bad: NDArray[np.integer], why: str, detail: Callable[[int], str]) -> str | None:
+def named(what: str, bad: NDArray[np.integer], why: str, detail: Callable[[int], str]) -> str | None:
+    """Returns a complaint about the first of the items `bad`, None without any."""
     if not bad.size:
         return None
     first = ", ".join(f"{what} {i} ({detail(i)})" for i in bad[:NAMED].tolist())

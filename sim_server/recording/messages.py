@@ -61,6 +61,8 @@ def topology(simulation: Simulation, body: Body) -> pb.Topology:
     )
     if any(pose.rotate) or any(pose.translate):
         message.reference = _bytes(body.mesh.rest, "<f8")
+    if body.mesh.quadratic is not None:
+        message.quadratic = _bytes(body.mesh.quadratic, "<i4")
     if body.skin is not None:
         message.skin_nodes, message.skin_weights = _bytes(body.skin.nodes, "<i4"), _bytes(body.skin.weights, "<f8")
         message.skin_triangles = _bytes(body.skin.triangles, "<i4")

@@ -6,7 +6,6 @@ from typing import Any, Literal, Protocol
 
 from pydantic_core import InitErrorDetails
 
-from sim_server.errors import InputError
 from sim_server.mesh import Mesh
 from sim_server.scene.integrator_options import IntegratorOptions
 from sim_server.scene.parameters import complaint
@@ -43,16 +42,15 @@ def element_errors(objects: Sequence[HasElements], integrator: IntegratorOptions
 
 
 def kind_of_elements(o: HasElements, mesh: Mesh, integrator: IntegratorOptions) -> Kind:
-    """Returns the kind that an object has; raises InputError for quadratic elements of a mesh without mid-nodes."""
-    quadratic = getattr(mesh, "quadratic", None) is not None
-    if o.elements == "quadratic" and not quadratic:
-        raise InputError(
-            f'object {o.name!r}: elements = "quadratic": mesh {mesh.name} has no mid-nodes; allowed: "auto", '
-            '"linear", "patch", "smoothed"'
-        )
+    """Returns the kind that an object with this mesh has."""
     if o.elements != "auto":
         return o.elements
-    return "quadratic" if quadratic and not _reason(o.effects, integrator) else "linear"
+    return "quadratic" if mesh.quadratic is not None and keeps_mid_nodes(o, integrator) else "linear"
+
+
+def keeps_mid_nodes(o: HasElements, integrator: IntegratorOptions) -> bool:
+    """Returns whether an object has quadratic elements if its mesh has mid-nodes."""
+    return o.elements == "quadratic" or (o.elements == "auto" and not _reason(o.effects, integrator))
 
 
 def _reason(effects: Mapping[str, Any], integrator: IntegratorOptions) -> str:

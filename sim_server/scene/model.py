@@ -23,7 +23,7 @@ from sim_server.errors import InputError
 from sim_server.mesh import Mesh, bar, check, read
 from sim_server.scene.accuracy_options import MOST_LINEARIZATIONS, ROUNDING, AccuracyOptions
 from sim_server.scene.effect_tables import checked_effects
-from sim_server.scene.elements import Elements, element_errors
+from sim_server.scene.elements import Elements, element_errors, keeps_mid_nodes
 from sim_server.scene.holders import Holder, check_holders_on, holder_errors
 from sim_server.scene.integrator_options import IntegratorOptions
 from sim_server.scene.live import Live
@@ -105,6 +105,11 @@ class SceneObject(Parameters):
     effects: Annotated[dict[str, BaseModel], *_effects("object")] = Field(default_factory=dict)
 
     _given: Mesh | None = PrivateAttr(None)
+    _keeps_mid_nodes: bool = PrivateAttr(False)
+
+    def choose_mid_nodes(self, integrator: IntegratorOptions) -> None:
+        """Sets whether the mesh keeps its mid-nodes, which depends on the integrator."""
+        self._keeps_mid_nodes = keeps_mid_nodes(self, integrator)
 
     def use_mesh(self, mesh: Mesh) -> None:
         """Sets the mesh to be used instead of the one that `mesh` names."""
@@ -130,10 +135,12 @@ class SceneObject(Parameters):
         source = self.mesh
         try:
             if source.file is not None:
-                mesh = read(source.file)
-                return check(replace(mesh, rest=mesh.rest * (source.scale or 1.0)))
-            assert source.bar is not None and source.size is not None and source.split is not None
-            return bar(source.bar, source.size, source.split)
+                mesh = read(source.file, self._keeps_mid_nodes)
+                mesh = check(replace(mesh, rest=mesh.rest * (source.scale or 1.0)))
+            else:
+                assert source.bar is not None and source.size is not None and source.split is not None
+                mesh = bar(source.bar, source.size, source.split)
+            return mesh.with_mid_nodes() if self.elements == "quadratic" else mesh
         except InputError as error:
             raise InputError(f"object {self.name!r}: {error}") from error
 
@@ -310,6 +317,8 @@ class Scene(Parameters):
     def _as_elements_need(self) -> "Scene":
         if errors := list(element_errors(self.objects, self.integrator)):
             raise ValidationError.from_exception_data("Scene", errors)
+        for o in self.objects:
+            o.choose_mid_nodes(self.integrator)
         return self
 
     @model_validator(mode="after")

@@ -39,6 +39,10 @@ class Parameters(BaseModel):
         """Kernels that an effect needs: bodies with different values are built apart (effects/_base.py, Build)."""
         return ""
 
+    def variant_of(self, elements: str) -> str:
+        """`variant` of a body with these elements, as scene/elements.py names their kinds."""
+        return self.variant
+
     @model_validator(mode="wrap")
     @classmethod
     def _name_the_known_keys(cls, table: Any, validate: ValidatorFunctionWrapHandler) -> Any:

@@ -10,7 +10,7 @@ from pydantic import AfterValidator, Discriminator, Field, Tag, ValidationError,
 from pydantic_core import InitErrorDetails
 from pydantic_core.core_schema import ValidatorFunctionWrapHandler
 
-from sim_server.arrays import Float64
+from sim_server.arrays import Float64, Int32
 from sim_server.errors import InputError
 from sim_server.scene import where
 from sim_server.scene.parameters import Parameters, Positive, Where, complaint
@@ -150,3 +150,17 @@ def region_values(young: float | list[Region], poisson: float | None, points: Fl
     """Returns Young's modulus [Pa] and Poisson's ratio [-] of each element, (m,) each; see constants_by_region."""
     found = constants_by_region({"young": young, "poisson": poisson}, points, "Pa")
     return found["young"], found["poisson"]
+
+
+def region_numbers(value: Any, points: Float64) -> Int32:
+    """Returns the region of each element, (m,): its place in the list of regions, 0 where there is one value for all.
+
+    value: the constant that may be a list of regions; points: centroids at rest, before the pose [m], (m, 3)
+    """
+    number = np.zeros(len(points), np.int32)
+    left = np.ones(len(points), dtype=bool)
+    for i, region in enumerate(value if isinstance(value, list) else []):
+        here = left & where.mask(region.where or "true", points)
+        number[here] = i
+        left &= ~here
+    return number

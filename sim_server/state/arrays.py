@@ -18,6 +18,7 @@ from sim_server.simulation import Simulation
 
 DERIVED = frozenset({
     "nodal_impulse", "scaled_gradients", "twist", "tangent", "corners", "edges",  # of elements
+    "strain", "dilatation", "mean_dilatation", "patch_gradients",  # of strain cells and patches
     "sums", "b", "diagonal", "mean", "b_material", "y", "values", "block",  # of the system
     "pull",  # of pushes and grabs
 })  # fmt: skip

@@ -99,4 +99,8 @@ def _mesh(topology: Topology) -> Mesh:
     rest = array(topology.reference or topology.rest, np.float64, (topology.nodes, 3), "Topology.rest", finite=True)
     tets = array(topology.tets, np.int32, (-1, 4), "Topology.tets")
     check_range(tets, 0, topology.nodes, "Topology.tets")
-    return check(Mesh(rest, tets, topology.header.object))
+    quadratic = None
+    if topology.quadratic:
+        quadratic = array(topology.quadratic, np.int32, (-1, 10), "Topology.quadratic")
+        check_range(quadratic, 0, topology.nodes, "Topology.quadratic")
+    return check(Mesh(rest, tets, topology.header.object, quadratic=quadratic))

@@ -2,8 +2,8 @@
 """Fusion of the launches of one domain into one kernel, which saves the gaps between many small launches.
 
 The text of a launch names its domain (`int n;  // nodes`). An item writes only its own rows and reads other domains in
-the order elements, nodes, blocks. So all launches of a domain may run one after another in the thread of an item, and
-arrays that only they use (`own<T>`) stay in its registers.
+the order of DOMAINS: cells are elements before their patches, corners are those of patches. So all launches of a domain
+may run one after another in the thread of an item, and arrays that only they use (`own<T>`) stay in its registers.
 
 Sums over lists come first: `lanes` threads per item add up its entries and leave the sum in shared memory. Then one
 thread per item does the rest. A launch whose arguments may be replaced looks up each item in its list (`node`,
@@ -21,7 +21,7 @@ from sim_server.backends.declarations import Declarations
 from sim_server.backends.gpu.cupy_types import KernelFunction
 from sim_server.backends.gpu.device import DeviceLaunch, compiled, cupy, options, own_headers, processors
 
-DOMAINS = ("elements", "nodes", "blocks")
+DOMAINS = ("cells", "patches", "elements", "corners", "nodes", "blocks")
 NUMBERS: dict[str, type[np.number[Any]]] = {"int": np.int32, "float": np.float32, "double": np.float64}
 
 
@@ -34,6 +34,8 @@ class BlockShape(NamedTuple):
 
 BLOCK_SHAPES = {  # by the largest number of items per multiprocessor; few items are spread over many multiprocessors
     "elements": {64: BlockShape(32, 1), 256: BlockShape(64, 1), 1 << 30: BlockShape(128, 1)},
+    "patches": {16: BlockShape(64, 16), 256: BlockShape(128, 8), 1 << 30: BlockShape(128, 4)},
+    "corners": {64: BlockShape(128, 8), 256: BlockShape(128, 4), 1 << 30: BlockShape(128, 2)},
     "nodes": {16: BlockShape(64, 16), 256: BlockShape(128, 8), 1 << 30: BlockShape(128, 4)},
     "blocks": {64: BlockShape(128, 8), 160: BlockShape(128, 4), 1 << 30: BlockShape(128, 2)},
 }

@@ -19,8 +19,8 @@ Each line is computed when this page is made, by the simulation as it runs (CPU,
 - *limit of the meshes*: linear tetrahedra are too stiff in bending (they lock) by a part that falls with the square of
   the element's size; the limit is extrapolated from the last two meshes on that assumption. Lines marked *(locking)*
   are what the meshes themselves give. Where no kind of elements is named, they are linear ones of bars with
-  `split = "kuhn"`, at whose diagonals locking shows most; with kinds named, bars are split as `mirrored` unless the line
-  says otherwise.
+  `split = "kuhn"`, at whose diagonals locking shows most; with kinds named, bars are split as `mirrored` unless the
+  line says otherwise.
 - Static cases are scenes with `[integrator] scheme = "quasi_static"` and Newton-Raphson to 1e-8 of the first residual,
   loads by pushes. The slender beams (length 20 times the height) have exact tangents (`projection = "none"`), full
   Newton steps and their load in parts; the made-up solutions have a line search.
@@ -37,8 +37,8 @@ OTHERS = [
     motion.preconditioners, *bending.CASES,
 ]  # fmt: skip
 LOCKING = """\
-Sag of a clamped bar of 1 x 1 x 4 m under a small weight over what it should be, by Poisson's ratio: the mean of the free
-face, over quadratic tetrahedra of an assembly of its own on a fine mesh. Each kind of `elements` in a scene; the
+Sag of a clamped bar of 1 x 1 x 4 m under a small weight over what it should be, by Poisson's ratio: the mean of the
+free face, over quadratic tetrahedra of an assembly of its own on a fine mesh. Each kind of `elements` in a scene; the
 unstructured meshes are Gmsh's (tests/bench/verification/meshes)."""
 
 

@@ -1,0 +1,106 @@
+# SPDX-License-Identifier: MIT
+"""Corotational strain cells in patches, cell by cell in plain NumPy: slow, and meant to be obviously right.
+
+W = sum_c V mu |dev(S - I)|^2 + sum_p kappa / 2 V_p theta_p^2 (effects/_cells.py); kappa of a patch is the mean by
+volume.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sim_server.mesh.strain_cells import StrainCells
+from tests.reference.corotational import nearest_rotation
+
+Array = NDArray[np.float64]
+
+
+@dataclass
+class CellSolid:
+    """A body: its cells, young and poisson (tets,) of its tetrahedra."""
+
+    cells: StrainCells
+    young: Array
+    poisson: Array
+
+    @property
+    def mu(self) -> Array:
+        """Of the cells [Pa]."""
+        return (self.young / (2 * (1 + self.poisson)))[self.cells.element]
+
+    @property
+    def patch_volume(self) -> Array:
+        return np.bincount(self.cells.patch, self.cells.volume)
+
+    @property
+    def kappa(self) -> Array:
+        """Of the patches [Pa]."""
+        of_cells = (self.young / (3 * (1 - 2 * self.poisson)))[self.cells.element]
+        return np.bincount(self.cells.patch, of_cells * self.cells.volume) / self.patch_volume
+
+    def of(self, c: int) -> tuple[NDArray, Array]:
+        """Nodes and gradients of a cell."""
+        here = slice(self.cells.start[c], self.cells.start[c + 1])
+        return self.cells.nodes[here], self.cells.gradients[here]
+
+    def polar(self, x: Array, c: int) -> tuple[Array, Array]:
+        nodes, g = self.of(c)
+        F = x[nodes].T @ g
+        R = nearest_rotation(F)
+        return R, R.T @ F
+
+    def theta(self, x: Array) -> Array:
+        """Of the patches [-]."""
+        cells = self.cells
+        trace = np.array([np.trace(self.polar(x, c)[1]) - 3 for c in range(len(cells.volume))])
+        return np.bincount(cells.patch, cells.volume * trace) / self.patch_volume
+
+    def energy(self, x: Array) -> float:
+        total = 0.5 * (self.kappa * self.patch_volume * self.theta(x) ** 2).sum()
+        for c, (V, mu) in enumerate(zip(self.cells.volume, self.mu, strict=True)):
+            E = self.polar(x, c)[1] - np.eye(3)
+            total += V * mu * ((E - np.trace(E) / 3 * np.eye(3)) ** 2).sum()
+        return float(total)
+
+    def forces(self, x: Array) -> Array:
+        """(n, 3)."""
+        f, theta, kappa = np.zeros_like(x), self.theta(x), self.kappa
+        for c, (V, mu, p) in enumerate(zip(self.cells.volume, self.mu, self.cells.patch, strict=True)):
+            (nodes, g), (R, S) = self.of(c), self.polar(x, c)
+            E = S - np.eye(3)
+            f[nodes] -= V * g @ (R @ (2 * mu * E + (kappa[p] * theta[p] - 2 / 3 * mu * np.trace(E)) * np.eye(3))).T
+        return f
+
+    def tangent(self, x: Array, exact: bool) -> Array:
+        """-df/dx with R held, or, if exact, turning as far as K stays definite; (3 n, 3 n)."""
+        K, theta, kappa = np.zeros((x.size, x.size)), self.theta(x), self.kappa
+        g_p = np.zeros((self.cells.patches, x.size))
+        for c, (V, mu, p) in enumerate(zip(self.cells.volume, self.mu, self.cells.patch, strict=True)):
+            (nodes, g), (R, _) = self.of(c), self.polar(x, c)
+            dofs = (3 * nodes[:, None] + np.arange(3)).ravel()
+            dF = np.einsum("il,kj->ijkl", np.eye(3), g).reshape(9, -1)  # dF_ij / dx_kl
+            U, s, Vt = np.linalg.svd(x[nodes].T @ g)
+            sign = np.sign(np.linalg.det(U @ Vt))
+            U[:, 2] *= sign
+            s[2] *= sign
+            r = R.ravel()
+            sym = _symmetric_part(R)
+            H = 2 * mu * sym.T @ sym - 2 / 3 * mu * np.outer(r, r)
+            if exact:
+                pressure = kappa[p] * theta[p] - 2 / 3 * mu * (s.sum() - 3)
+                for a, b in ((0, 1), (1, 2), (0, 2)):
+                    t = (np.outer(U[:, a], Vt[b]) - np.outer(U[:, b], Vt[a])).ravel() / np.sqrt(2)
+                    H += max(2 * mu + (pressure - 2 * mu) * 2 / (s[a] + s[b]), 0.0) * np.outer(t, t)
+            K[np.ix_(dofs, dofs)] += V * dF.T @ H @ dF
+            g_p[p, dofs] += V * (r @ dF)
+        for p, row in enumerate(g_p):
+            K += kappa[p] / self.patch_volume[p] * np.outer(row, row)
+        return K
+
+
+def _symmetric_part(R: Array) -> Array:
+    """The map from dF to the symmetric part of R^T dF, in the world's frame of rows: (9, 9), a projection."""
+    to_frame = np.kron(R.T, np.eye(3))
+    swap = np.eye(9).reshape(3, 3, 3, 3).transpose(1, 0, 2, 3).reshape(9, 9)
+    return 0.5 * (np.eye(9) + swap) @ to_frame
