@@ -13,7 +13,7 @@ from sim_server.simulation import Simulation
 from tests.state import put
 
 FIXED = {"fixed": {"where": "X < 0.01"}}
-BAR = {"bar": [3, 1, 1], "size": [1.5, 0.5, 0.5]}
+BAR = {"bar": [3, 1, 1], "size": [1.5, 0.5, 0.5], "split": "kuhn"}
 REGIONS = [{"where": "X < 0.7", "young": 2e5}, {"young": 5e4, "poisson": 0.2}]
 YOUNG = {"young": 1e5, "poisson": 0.3}
 STRETCHED = {"direction": [[1, 0, 0], [0, 1, 0]]}
