@@ -14,7 +14,7 @@ NAMED = 3  # objects named in a line
 def scene_notes(simulation: Simulation) -> list[str]:
     """Returns at most two lines: bodies that fall apart or fall freely, and nearly incompressible materials.
 
-    A body falls if gravity acts on it and no element connects it to a fixed node, even if clients may grab it; not
+    A body falls if gravity acts on it and no element connects it to a fixed node or a roller, even if clients may grab it; not
     where there are obstacles, on which it may land. In a quasi-static scene such a body is refused.
     """
     return [line for line in (_loose(simulation), _incompressible(simulation)) if line]
@@ -28,7 +28,10 @@ def _loose(simulation: Simulation) -> str:
         and world.at_start(world.gravity_of).any()
     )
     part, elastic = _parts(simulation)
-    held = np.isin(part, part[world.free == 0])
+    fixed = world.free == 0
+    if world.rollers is not None:
+        fixed |= world.rollers.limited > 0
+    held = np.isin(part, part[fixed])
     apart, falling, partly = [], [], []
     for body in world.bodies:
         loose = int((~held[body.nodes]).sum())
