@@ -49,6 +49,7 @@ class Effect:
 
     name: as scenes list it.
     elements (m, c): node numbers (of the scene) of the elements whose c = 2 or 4 corners the effect couples, or None.
+    surface (t, 3): node numbers of triangles that its launches over elements go through, or None.
     rotated: the bodies whose elements add their rotations to system.mean for the warp; nodes of other bodies get
     theirs by shape matching. elastic: by body index, Young's modulus [Pa] and Poisson's ratio of its elements, (m,)
     each, for viewers.
@@ -56,6 +57,7 @@ class Effect:
 
     name = ""
     elements: Int32 | None = None
+    surface: Int32 | None = None
     rotated: tuple[Body, ...] = ()
     elastic: Mapping[int, tuple[Float64, Float64]] = MappingProxyType({})
 
@@ -109,6 +111,7 @@ class Effect:
         """Returns arrays that the energy balance of a step reads, by their names in backends.energies; {} for most.
 
         gravity: acceleration (3,) [m/s2]. force (n, 3) [N], spring (n,) [N/m], anchor (n, 3) [m]: of pushes and grabs.
+        load (n, 3): of surfaces [N].
         """
         return {}
 

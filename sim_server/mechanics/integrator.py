@@ -89,9 +89,13 @@ class InitialWeights:
 
 
 class CouplesNodes(Protocol):
-    """An effect, as far as it couples nodes. elements (m, c): node numbers of the corners of its elements, or None."""
+    """An effect, as far as it couples nodes. elements (m, c): node numbers of the corners of its elements, or None.
+
+    surface (t, 3): those of triangles, or None
+    """
 
     elements: Int32 | None
+    surface: Int32 | None
 
 
 class Integrator:
@@ -255,8 +259,8 @@ class Integrator:
 
 
 def rows_of(effects: Sequence[CouplesNodes]) -> list[Int32]:
-    """Returns one corner of each element, per effect that has some."""
-    return [e.elements[:, 0] for e in effects if e.elements is not None]
+    """Returns one corner of each element or triangle, per effect that has some."""
+    return [corners[:, 0] for e in effects for corners in (e.elements, e.surface) if corners is not None]
 
 
 def items_of_bodies(launch: Launch, starts: Int32, row: Int32, firsts: list[Int32], held: Int32) -> Int32 | None:

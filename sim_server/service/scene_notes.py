@@ -14,8 +14,8 @@ NAMED = 3  # objects named in a line
 def scene_notes(simulation: Simulation) -> list[str]:
     """Returns at most two lines: bodies that fall apart or fall freely, and nearly incompressible materials.
 
-    A body falls if gravity acts on it and no element connects it to a fixed node or a roller, even if clients may grab it; not
-    where there are obstacles, on which it may land. In a quasi-static scene such a body is refused.
+    A body falls if gravity acts on it and no element connects it to a fixed node or a roller, even if clients may grab
+    it; not where there are obstacles, on which it may land. In a quasi-static scene such a body is refused.
     """
     return [line for line in (_loose(simulation), _incompressible(simulation)) if line]
 
