@@ -15,8 +15,8 @@ NAMED = 3  # objects named in a line
 def scene_notes(simulation: Simulation) -> list[str]:
     """Returns lines: bodies that fall apart or fall freely, nearly incompressible materials, and elements that lock.
 
-    A body falls if gravity acts on it and no element connects it to a fixed node, even if clients may grab it; not
-    where there are obstacles, on which it may land. In a quasi-static scene such a body is refused.
+    A body falls if gravity acts on it and no element connects it to a fixed node or a roller, even if clients may grab
+    it; not where there are obstacles, on which it may land. In a quasi-static scene such a body is refused.
     """
     locking = [f"{_names(bodies)} {text}" for bodies, text in locking_notes(simulation)]
     return [line for line in (_loose(simulation), _incompressible(simulation), *locking) if line]
@@ -30,7 +30,10 @@ def _loose(simulation: Simulation) -> str:
         and world.at_start(world.gravity_of).any()
     )
     part, elastic = _parts(simulation)
-    held = np.isin(part, part[world.free == 0])
+    fixed = world.free == 0
+    if world.rollers is not None:
+        fixed |= world.rollers.limited > 0
+    held = np.isin(part, part[fixed])
     apart, falling, partly = [], [], []
     for body in world.bodies:
         loose = int((~held[body.nodes]).sum())
