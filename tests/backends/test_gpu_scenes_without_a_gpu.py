@@ -47,6 +47,18 @@ SCENES = {
         "integrator.linearizations=2",
         "solver.precision=mixed",
     ),
+    "beam.toml, patches": ("object.beam.elements=patch",),
+    "beam.toml, smoothed in float32, exact tangent": (
+        "object.beam.elements=smoothed",
+        "solver.precision=float32",
+        "integrator.scheme=newmark",
+    ),
+    "beam.toml, quadratic, mixed, ros2": (
+        "object.beam.elements=quadratic",
+        "solver.precision=mixed",
+        "integrator.scheme=ros2",
+    ),
+    "beam.toml, smoothed, Newton": ("object.beam.elements=smoothed", "integrator.linearizations=3"),
     "springs.toml": (),
     "fibres.toml": ("integrator.scheme=bdf2",),
     "equilibrium.toml": (),
@@ -86,6 +98,18 @@ def test_a_scene_is_built_and_its_kernels_compile(cupy, name):
     engine.settle_factors()
     engine.run(1)
     assert engine.factor_bytes(body.index) > 9 * nodes
+
+
+@pytest.mark.parametrize("tangent", ["usual", "exact"])
+def test_launches_over_cells_and_patches_are_put_together_by_domain(cupy, tangent):
+    """Cells, patches, elements, corners of patches, nodes, blocks: one kernel each, and the end of the step."""
+    keys = ["object.beam.elements=smoothed", f"object.beam.effects.corotational.tangent={tangent}"]
+    Simulation.load("deploy/scenes/beam.toml", keys, "gpu")
+    names = [kernel for kernel, _ in cupy.calls]
+    assert not {"measure", "means", "elements", "exact_elements", "gather", "gradients", "own_blocks", "blocks"} & set(
+        names
+    )
+    assert names[: names.index("pcg")].count("fused") >= 6
 
 
 def written_back(simulation):
