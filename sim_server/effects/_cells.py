@@ -247,7 +247,7 @@ class StrainCellElements(Effect):
 
 
 def cells_of(body: Body, params: Any) -> StrainCells:
-    """Strain cells of a body, in an order that keeps neighbours near in memory; raises InputError."""
+    """Strain cells of a body, in an order that keeps neighbours near in memory."""
     mesh = body.mesh
     if body.elements == "quadratic":
         assert mesh.quadratic is not None
