@@ -100,6 +100,18 @@ def test_a_scene_is_built_and_its_kernels_compile(cupy, name):
     assert engine.factor_bytes(body.index) > 9 * nodes
 
 
+@pytest.mark.parametrize("tangent", ["usual", "exact"])
+def test_launches_over_cells_and_patches_are_put_together_by_domain(cupy, tangent):
+    """Cells, patches, elements, corners of patches, nodes, blocks: one kernel each, and the end of the step."""
+    keys = ["object.beam.elements=smoothed", f"object.beam.effects.corotational.tangent={tangent}"]
+    Simulation.load("deploy/scenes/beam.toml", keys, "gpu")
+    names = [kernel for kernel, _ in cupy.calls]
+    assert not {"measure", "means", "elements", "exact_elements", "gather", "gradients", "own_blocks", "blocks"} & set(
+        names
+    )
+    assert names[: names.index("pcg")].count("fused") >= 6
+
+
 def written_back(simulation):
     """Reads and writes all state of a simulation."""
     arrays = state_arrays(simulation)
