@@ -88,13 +88,13 @@ class Params(Parameters):
     stress: Annotated[Vector | None, Live()] = Field(default=None, description=ABOUT["stress"])
     pressure: Annotated[float | None, Live()] = Field(default=None, description=ABOUT["pressure"])
     moment: Annotated[Vector | None, Live()] = Field(default=None, description=ABOUT["moment"])
-    tables: Annotated[tuple[Load, ...], BeforeValidator(as_tuple), Field(min_length=1)] | None = Field(
+    tables: Annotated[tuple[Load, ...], BeforeValidator(as_tuple)] | None = Field(
         default=None, description="loads on several parts, each { where, force, stress, pressure, moment }"
     )
 
     @model_validator(mode="after")
     def _one_form(self) -> "Params":
-        if (self.where is None) == (self.tables is None):
+        if (self.where is None) == (not self.tables):
             raise complaint("needs where = ..., or a list of tables with where = ... each")
         if self.tables is None:
             params: Params = _some_load(self)
