@@ -152,7 +152,7 @@ class Part:
     def _slope(self, moment: Float64, arm: Float64) -> Float64:
         """Returns c (3,) [Pa/m] of the linear pressure. arm (t, 3, 3): corners from the centroid [m]."""
         normals = self.area / self._size[:, None]
-        normal = self.area.sum(axis=0) / np.linalg.norm(self.area.sum(axis=0))
+        normal = normals[self._size.argmax()]
         said = f"object {self.name!r}: traction moment where = {self.where!r}"
         if np.linalg.norm(np.cross(normals, normal), axis=1).max() > FLAT or (normals @ normal).min() < 0:
             raise InputError(f"{said}: the triangles must lie in one plane")
