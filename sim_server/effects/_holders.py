@@ -29,7 +29,6 @@ from sim_server.arrays import Float64, Int32
 from sim_server.backends.base import Launch, Module
 from sim_server.backends.state import rows_in
 from sim_server.effects._movable import Movable, pose_of
-from sim_server.effects.fixed import held_nodes
 from sim_server.errors import InputError
 from sim_server.mechanics.system import Stencil, System
 from sim_server.mechanics.world import World
@@ -232,7 +231,9 @@ def _mask(world: World, holder: Holder) -> NDArray[np.bool_]:
     fixed = body.effects.get("fixed")
     others = world.held > 0
     if fixed is not None:
-        others[body.nodes] |= held_nodes(fixed, body.mesh.rest)
+        from sim_server.effects.fixed import clamped_nodes  # what a scene does not list is not imported
+
+        others[body.nodes] |= clamped_nodes(fixed, body.mesh.rest)
     if (held & others).any():
         raise InputError(
             f"holder {holder.name!r}: {int((held & others).sum())} of its nodes are fixed, or another holder's: a node "

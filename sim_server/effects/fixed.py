@@ -11,7 +11,8 @@ a plane of symmetry. Directions are of the object at rest and turn with its pose
 coordinates; while the body moves they stay what they are. A plane does not turn.
 
 A list holds several groups: ``fixed = [{ where = "X < 0.01" }, { where = "Y < 0.01", along = "y" }]``. A node in
-several keeps its place along all of their directions and what these span; with three it is a fixed one.
+several keeps its place along all of their directions and what these span; with three it is a fixed one. Nodes of a
+holder go where that says.
 
 `where` selects nodes by rest coordinates X, Y, Z [m], before the pose, so turning an object never changes what is
 held. Example: ``fixed = { where = "X < 0.01" }`` holds the end face of a bar along x. Take a bound between the
@@ -56,7 +57,7 @@ def _direction(value: Any) -> tuple[str, ...] | tuple[float, ...]:
     raise complaint('must be "x", "y" or "z", a list of these, or a vector of three numbers that is not zero')
 
 
-Along = Annotated[tuple[str, ...] | tuple[float, ...], PlainValidator(_direction)]
+Along = Annotated[Any, PlainValidator(_direction)]  # tuple[str, ...] or tuple[float, float, float]
 ABOUT_WHERE = "nodes to hold: an expression in X, Y, Z, the rest coordinates [m]"
 ABOUT_ALONG = '"x", "y" or "z", a list of these, or a vector, at rest; all directions if left out'
 
@@ -71,13 +72,13 @@ class Group(Parameters):
 class Params(Parameters):
     where: Where | None = Field(default=None, description=ABOUT_WHERE)
     along: Along | None = Field(default=None, description=ABOUT_ALONG)
-    tables: Annotated[tuple[Group, ...], BeforeValidator(as_tuple), Field(min_length=1)] | None = Field(
+    tables: Annotated[tuple[Group, ...], BeforeValidator(as_tuple)] | None = Field(
         default=None, description="several groups of nodes, each { where, along }"
     )
 
     @model_validator(mode="after")
     def _one_form(self) -> "Params":
-        if (self.where is None) == (self.tables is None):
+        if (self.where is None) == (not self.tables):
             raise complaint("needs where = ..., or a list of tables with where = ... each")
         if self.tables is not None and self.along is not None:
             raise complaint("along: stands in the tables of the list")
@@ -92,9 +93,10 @@ class Params(Parameters):
         return (Group(where=self.where, along=self.along),)
 
 
-def held_nodes(params: Params, rest: Float64) -> NDArray[np.bool_]:
-    """Returns which nodes some group holds, along whatever directions, (n,). rest (n, 3) [m]."""
-    return np.any([where.mask(group.where, rest) for group in params.groups], axis=0)
+def clamped_nodes(params: Params, rest: Float64) -> NDArray[np.bool_]:
+    """Returns which nodes a group holds along all directions, (n,). rest (n, 3) [m]."""
+    none = np.zeros(len(rest), bool)
+    return np.any([none, *(where.mask(g.where, rest) for g in params.groups if g.along is None)], axis=0)
 
 
 def build(world: World, listed: list[tuple[Body, Any]]) -> Effect:
@@ -111,6 +113,7 @@ def build(world: World, listed: list[tuple[Body, Any]]) -> Effect:
             )
         world.free[body.nodes] = np.where(fixed, 0.0, world.free[body.nodes])
         sliding = {body.first + node: span for node, span in enumerate(kept) if 0 < len(span) < 3}
+        sliding = {node: span for node, span in sliding.items() if not world.held[node]}
         if sliding:
             _check_alone(world, body)
         found |= sliding

@@ -88,13 +88,13 @@ class Params(Parameters):
     stress: Annotated[Vector | None, Live()] = Field(default=None, description=ABOUT["stress"])
     pressure: Annotated[float | None, Live()] = Field(default=None, description=ABOUT["pressure"])
     moment: Annotated[Vector | None, Live()] = Field(default=None, description=ABOUT["moment"])
-    tables: Annotated[tuple[Load, ...], BeforeValidator(as_tuple), Field(min_length=1)] | None = Field(
+    tables: Annotated[tuple[Load, ...], BeforeValidator(as_tuple)] | None = Field(
         default=None, description="loads on several parts, each { where, force, stress, pressure, moment }"
     )
 
     @model_validator(mode="after")
     def _one_form(self) -> "Params":
-        if (self.where is None) == (self.tables is None):
+        if (self.where is None) == (not self.tables):
             raise complaint("needs where = ..., or a list of tables with where = ... each")
         if self.tables is None:
             params: Params = _some_load(self)
@@ -152,7 +152,7 @@ class Part:
     def _slope(self, moment: Float64, arm: Float64) -> Float64:
         """Returns c (3,) [Pa/m] of the linear pressure. arm (t, 3, 3): corners from the centroid [m]."""
         normals = self.area / self._size[:, None]
-        normal = self.area.sum(axis=0) / np.linalg.norm(self.area.sum(axis=0))
+        normal = normals[self._size.argmax()]
         said = f"object {self.name!r}: traction moment where = {self.where!r}"
         if np.linalg.norm(np.cross(normals, normal), axis=1).max() > FLAT or (normals @ normal).min() < 0:
             raise InputError(f"{said}: the triangles must lie in one plane")
