@@ -10,6 +10,7 @@ from sim_server.arrays import Float64, Int32, Int64
 from sim_server.mechanics.world import World
 
 Couplings = tuple[Int64, Int32, Int32]
+Places = tuple[Int32, Int32, Int32, Int32, Int32, Int32]
 SLICE = 32  # clusters of a slice: threads of a warp (kernels/strain_cells.cuh)
 
 
@@ -59,7 +60,7 @@ def couplings(clusters: Clusters, world: World) -> Couplings:
     return np.concatenate([np.zeros(0, np.int64), *keys]), every, clusters.owner[every[:, 0]]
 
 
-def places(clusters: Clusters, found: Couplings, n: int, blocks: Int64) -> tuple[Int32, ...]:
+def places(clusters: Clusters, found: Couplings, n: int, blocks: Int64) -> Places:
     """Returns the members of a Stencil (system.py) but for patches.
 
     found: couplings of the clusters; n: nodes; blocks: keys of all blocks, ascending

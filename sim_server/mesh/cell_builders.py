@@ -36,7 +36,7 @@ def edge_cells(rest: Float64, tets: Int32, region: Int32) -> StrainCells:
     keys = np.concatenate([ends, region[tet_of, None]], axis=1)
     _, element, cell = np.unique(keys, axis=0, return_index=True, return_inverse=True)
     cell, cells = cell.ravel(), len(element)
-    total = np.bincount(cell, share, cells)
+    total: Float64 = np.bincount(cell, share, cells).astype(np.float64)
     nodes = tets[tet_of]  # (6 m, 4), of the parts of cells
     pairs, place = np.unique(cell[:, None] * len(rest) + nodes, return_inverse=True)
     weighted = (share / total[cell])[:, None, None] * gradients[tet_of]

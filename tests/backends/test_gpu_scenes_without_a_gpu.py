@@ -47,6 +47,18 @@ SCENES = {
         "integrator.linearizations=2",
         "solver.precision=mixed",
     ),
+    "beam.toml, patches": ("object.beam.elements=patch",),
+    "beam.toml, smoothed in float32, exact tangent": (
+        "object.beam.elements=smoothed",
+        "solver.precision=float32",
+        "integrator.scheme=newmark",
+    ),
+    "beam.toml, quadratic, mixed, ros2": (
+        "object.beam.elements=quadratic",
+        "solver.precision=mixed",
+        "integrator.scheme=ros2",
+    ),
+    "beam.toml, smoothed, Newton": ("object.beam.elements=smoothed", "integrator.linearizations=3"),
     "springs.toml": (),
     "fibres.toml": ("integrator.scheme=bdf2",),
     "equilibrium.toml": (),

@@ -17,8 +17,8 @@ from tests.physics.test_forces import REGIONS, SIZE, stir
 from tests.reference.strain_cells import CellSolid
 from tests.scenes import bar, interior, jittered_bar, mesh_file, random_rotations, simulation
 
-KINDS = ("patch", "smoothed")
-both = pytest.mark.parametrize("kind", KINDS)
+both = pytest.mark.parametrize("kind", ["patch", "smoothed"])  # built of linear tetrahedra
+every_kind = pytest.mark.parametrize("kind", ["patch", "smoothed", "quadratic"])
 BUILDERS = {"patch": tetrahedron_cells, "smoothed": edge_cells}
 ROUNDING = 1e-11
 
@@ -106,7 +106,7 @@ def test_parts_that_touch_nowhere_share_no_patch():
     assert not set(number[:2]) & set(number[2:])
 
 
-@both
+@every_kind
 @pytest.mark.parametrize("size", [0.02, 0.3])
 def test_forces_and_energy_are_the_reference_and_its_slope(tmp_path, kind, size):
     """With two regions, and elements turned over by the larger one."""
@@ -122,7 +122,7 @@ def test_forces_and_energy_are_the_reference_and_its_slope(tmp_path, kind, size)
     assert abs(slope + (solid.forces(x) * direction).sum()) < 1e-6 * abs(slope)
 
 
-@both
+@every_kind
 @pytest.mark.parametrize("size", [0.02, 0.3])
 @pytest.mark.parametrize("kind_of_tangent", ["usual", "exact"])
 def test_the_matrix_is_the_reference_and_semi_definite(tmp_path, kind, size, kind_of_tangent):
@@ -134,7 +134,7 @@ def test_the_matrix_is_the_reference_and_semi_definite(tmp_path, kind, size, kin
     assert np.linalg.eigvalsh(found)[0] > -1e-10 * np.abs(found).max()
 
 
-@both
+@every_kind
 def test_the_exact_tangent_is_the_slope_of_the_forces_under_tension(tmp_path, kind):
     sim = cell_bar(tmp_path, kind, tangent="exact")
     R = random_rotations(1, seed=3)[0]
@@ -146,7 +146,7 @@ def test_the_exact_tangent_is_the_slope_of_the_forces_under_tension(tmp_path, ki
     assert np.abs(K @ direction.ravel() + slope.ravel()).max() < 1e-6 * np.abs(slope).max()
 
 
-@both
+@every_kind
 def test_rigid_motion_makes_no_force(tmp_path, kind):
     sim = cell_bar(tmp_path, kind)
     stretched = 1.01 * sim.world.rest
@@ -156,7 +156,7 @@ def test_rigid_motion_makes_no_force(tmp_path, kind):
     assert np.abs(forces(sim)).max() < 1e-10 * scale
 
 
-@both
+@every_kind
 def test_a_linear_displacement_is_in_equilibrium_inside(tmp_path, kind):
     """The patch test: one material, any cells."""
     sim = cell_bar(tmp_path, kind, young=1e5, poisson=0.45)
