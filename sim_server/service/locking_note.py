@@ -27,7 +27,7 @@ def locking_notes(simulation: Simulation) -> Iterator[tuple[list[Body], str]]:
     alike: dict[tuple[str, float, str], list[Body]] = {}
     for body, poisson in sorted(_nearly_incompressible(simulation).items()):
         b = simulation.world.bodies[body]
-        mesh = objects[b.name].mesh.split or "unstructured"
+        mesh: str = objects[b.name].mesh.split or "unstructured"
         alike.setdefault((mesh, poisson, _remedy(objects[b.name], simulation)), []).append(b)
     for (mesh, poisson, remedy), bodies in alike.items():
         of = "an unstructured mesh" if mesh == "unstructured" else f'split = "{mesh}"'
