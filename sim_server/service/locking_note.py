@@ -27,7 +27,7 @@ def locking_notes(simulation: Simulation) -> Iterator[tuple[list[Body], str]]:
     alike: dict[tuple[str, float, str], list[Body]] = {}
     for body, poisson in sorted(_nearly_incompressible(simulation).items()):
         b = simulation.world.bodies[body]
-        mesh = objects[b.name].mesh.split or "unstructured"
+        mesh: str = objects[b.name].mesh.split or "unstructured"
         alike.setdefault((mesh, poisson, _remedy(objects[b.name], simulation)), []).append(b)
     for (mesh, poisson, remedy), bodies in alike.items():
         of = "an unstructured mesh" if mesh == "unstructured" else f'split = "{mesh}"'
@@ -49,9 +49,9 @@ def kept(mesh: str, poisson: float) -> float:
 def _nearly_incompressible(simulation: Simulation) -> dict[int, float]:
     """The largest Poisson's ratio of each body of linear tetrahedra, by its index, where it is above LOCKS."""
     found: dict[int, float] = {}
-    for name, effect in simulation.effects.items():
+    for effect in simulation.effects.values():
         for body, (_, poisson) in effect.elastic.items():
-            linear = name != "corotational" or simulation.world.bodies[body].elements == "linear"
+            linear = effect.name != "corotational" or simulation.world.bodies[body].elements == "linear"
             if linear and round(float(poisson.max()), 2) > LOCKS:
                 found[body] = max(found.get(body, 0.0), float(poisson.max()))
     return found
