@@ -14,7 +14,7 @@ struct CorotationalCells {
     const real* x;           // (nodes, 3) positions [m]
     const real* v;           // (nodes, 3) world.damping_velocity [m/s]
     const local* gradients;  // (3, slots) [1/m]
-    const local* volume;     // (n,) V [m3]
+    const local* volume;     // (n,) V [m3], 0 where the cell has a deviator alone
     local* quaternion;       // (n, 4) out: unit quaternion of the nearest rotation of F, w first; of `measure_near` also in
     local* strain;           // (15, n) out: S = R^T F, its upper triangle, and T = R^T dF/dt [1/s], row major
     local* dilatation;       // (n, 2) out: V tr(S - I) [m3], V tr T [m3/s]
@@ -60,7 +60,7 @@ struct CorotationalCellImpulses {
     const local* gradients;              // (3, slots) [1/m]
     const int* patch;                    // (n,) of the cell
     const local* mean_dilatation;        // (patches, 2) theta [-], its rate [1/s]
-    const local* moduli;                 // (2, n) mu V, kappa V [Pa m3]
+    const local* moduli;                 // (3, n) mu V and kappa V, or 0 where the cell has none of it, and mu V [Pa m3]
     const local* stiffness_coefficient;  // (n,) h (c + beta) [s2], c world.dx_dv, beta the Rayleigh damping of the stiffness
     local h;                             // world.force_coefficient: the time step in backward Euler [s]
     const local* quaternion;             // (n, 4) unit quaternions
@@ -92,16 +92,21 @@ template <class P> INLINE local_mat3 cell_stress(const P& p, index i, const loca
 }
 
 template <class P> INLINE local_mat3 cell_twists(const P& p, index i, const local_mat3& S) {
-    const local_number mu = at_items(p.moduli, i), kappa = at_items(p.moduli + p.n, i);
-    const local_number theta = at(p.mean_dilatation, 2 * at(p.patch, i));
-    return twists(S, kappa / mu * theta - (local)(2.0 / 3) * (trace(S) - 3) - 2);
+    const local_number modulus = 1 / at_items(p.moduli + 2 * (long long)p.n, i), theta = at(p.mean_dilatation, 2 * at(p.patch, i));
+    const local_number mu = modulus * at_items(p.moduli, i), kappa = modulus * at_items(p.moduli + p.n, i);
+    return twists(S, mu, kappa * theta - mu * ((local)(2.0 / 3) * (trace(S) - 3) + 2));
+}
+
+// h (c + beta) times the modulus that scales gradients.
+template <class P> INLINE local_number cell_scale(const P& p, index i) {
+    return at_items(p.stiffness_coefficient, i) * at_items(p.moduli + 2 * (long long)p.n, i);
 }
 
 KERNEL(impulses, CorotationalCellImpulses) {
     local_mat3 S, T;
     get_strain(p, i, S, T);
     local_mat3 P = cell_stress(p, i, S, T);
-    if (p.exact) add_spin_stress(P, T, cell_twists(p, i, S), at_items(p.stiffness_coefficient, i) * at_items(p.moduli, i));
+    if (p.exact) add_spin_stress(P, T, cell_twists(p, i, S), cell_scale(p, i));
     P = mul(cell_rotation(p, i), P);
     put_cell_impulses(cell_slots(p.first, p.width, i), i, p.n, p.gradients, p.slots, P, p.nodal_impulse);
 }
@@ -114,7 +119,7 @@ struct CorotationalCellElements {
     const local* gradients;              // (3, slots) [1/m]
     const int* patch;                    // (n,) of the cell
     const local* mean_dilatation;        // (patches, 2) theta [-], its rate [1/s]
-    const local* moduli;                 // (2, n) mu V, kappa V [Pa m3]
+    const local* moduli;                 // (3, n) mu V and kappa V, or 0 where the cell has none of it, and mu V [Pa m3]
     const local* stiffness_coefficient;  // (n,) h (c + beta) [s2]
     local h;                             // world.force_coefficient [s]
     const local* quaternion;             // (n, 4) unit quaternions
@@ -126,7 +131,7 @@ struct CorotationalCellElements {
 template <class P> INLINE void put_cell_results(const P& p, index i, const local_mat3& stress, const local_mat3& R) {
     const slots s = cell_slots(p.first, p.width, i);
     put_cell_impulses(s, i, p.n, p.gradients, p.slots, mul(R, stress), p.nodal_impulse);
-    const local_number w = sqrt(at_items(p.stiffness_coefficient, i) * at_items(p.moduli, i));
+    const local_number w = sqrt(cell_scale(p, i));
     put_cell_gradients(s, i, p.n, p.gradients, p.slots, R, w, local_number{} - (local)(2.0 / 3), p.scaled_gradients);
 }
 
@@ -144,7 +149,7 @@ struct CorotationalExactCellElements {
     const local* gradients;              // (3, slots) [1/m]
     const int* patch;                    // (n,) of the cell
     const local* mean_dilatation;        // (patches, 2) theta [-], its rate [1/s]
-    const local* moduli;                 // (2, n) mu V, kappa V [Pa m3]
+    const local* moduli;                 // (3, n) mu V and kappa V, or 0 where the cell has none of it, and mu V [Pa m3]
     const local* stiffness_coefficient;  // (n,) h (c + beta) [s2]
     local h;                             // world.force_coefficient [s]
     const local* quaternion;             // (n, 4) unit quaternions
@@ -158,7 +163,7 @@ KERNEL(exact_elements, CorotationalExactCellElements) {
     local_mat3 S, T;
     get_strain(p, i, S, T);
     local_mat3 P = cell_stress(p, i, S, T), E = cell_twists(p, i, S), R = cell_rotation(p, i);
-    add_spin_stress(P, T, E, at_items(p.stiffness_coefficient, i) * at_items(p.moduli, i));
+    add_spin_stress(P, T, E, cell_scale(p, i));
     put_cell_results(p, i, P, R);
     E = mul(R, mul(E, transposed(R)));
     const local_number row[6] = {E.m[0], E.m[1], E.m[2], E.m[4], E.m[5], E.m[8]};
@@ -173,8 +178,8 @@ struct CorotationalCellEnergy {
     const int* nodes;        // (slots,)
     const real* x;           // (nodes, 3) [m]
     const local* gradients;  // (3, slots) [1/m]
-    const local* volume;     // (n,) V [m3]
-    const local* moduli;     // (2, n) mu V, kappa V [Pa m3]
+    const local* volume;     // (n,) V [m3], 0 where the cell has a deviator alone
+    const local* moduli;     // (3, n) mu V, or 0 where the cell has none of it, first [Pa m3]
     local* dilatation;       // (n,) out: V tr(S - I) [m3]
     local* energy;           // (n,) out: V mu |dev(S - I)|^2, S = R^T F [J]
 };

@@ -20,7 +20,7 @@ struct CorotationalExactElements {
 };
 
 INLINE local_mat3 twists(const local_mat3& S, local_number lambda, local_number mu) {
-    return twists(S, lambda / mu * (trace(S) - 3) - 2);
+    return twists(S, local_number{} + 1, lambda / mu * (trace(S) - 3) - 2);
 }
 
 // The stress of `hooke` and what E adds to it, which is of the spin of T.
