@@ -4,22 +4,26 @@
 A cell c has one deformation gradient F = sum_a x_a (x) G_a over its nodes, R the rotation nearest to F = R S, volume V;
 a patch p of cells one mean dilatation (mesh/strain_cells.py). The energy is ::
 
-    W = sum_c V mu |dev(S - I)|^2 + sum_p kappa / 2 V_p theta_p^2,   theta_p = sum_c V tr(S - I) / V_p
+    W = sum_c V (mu |S - I|^2 + lambda_c / 2 tr(S - I)^2) + sum_p kappa / 2 V_p theta_p^2
 
-with kappa = lambda + 2/3 mu, in a patch with several constants their mean by volume; of `smoothed` elements the first
-sum is over edges and theta that of tetrahedra (mesh/cell_builders.py), each cell having one of both roles. Forces are
-its slope ::
+    theta_p = sum_c V tr(S - I) / V_p
 
-    f_a = -sum_c V R (2 mu dev(S - I) + kappa theta_p I) G_a
+with kappa = lambda - lambda_c, in a patch with several constants their mean by volume. With lambda_c = -2/3 mu cells
+have energy of their deviators alone: so in patches of tetrahedra. Points of quadratic elements keep lambda_c =
+min(lambda, mu): without, an element resists none of the three quadratic motions whose strain is a multiple of I that
+is 0 on average, and meshes of few elements across are too soft; with it they lock no more. Forces are its slope ::
 
-and the usual tangent, with R held, is that of the deviators and one matrix of rank one for each patch ::
+    f_a = -sum_c V R (2 mu (S - I) + (lambda_c tr(S - I) + kappa theta_p) I) G_a
 
-    K_ab = sum_c V mu (g_b g_a^T + (g_a . g_b) I - 2/3 g_a g_b^T) + sum_p kappa V_p g_p,a g_p,b^T,   g_a = R G_a
+and the usual tangent, with R held, is that of the cells and one matrix of rank one for each patch, g_a = R G_a ::
+
+    K_ab = sum_c V (mu (g_b g_a^T + (g_a . g_b) I) + lambda_c g_a g_b^T) + sum_p kappa V_p g_p,a g_p,b^T
 
 with g_p,a = sum_c V R G_a / V_p, positive semi-definite as it is. The exact one adds the twists of each cell, as in
-corotational.py with the pressure p = kappa theta_p - 2/3 mu tr(S - I) in the place of lambda tr(S - I); of `smoothed`
-elements those of the deviator and of the pressure are kept from being negative each for itself, so that the matrix is a
-little stiffer than the forces.
+corotational.py with the pressure p = kappa theta_p + lambda_c tr(S - I) in the place of lambda tr(S - I).
+
+Of `smoothed` elements edges have the deviators and tetrahedra theta_p (mesh/cell_builders.py). The twists of each are
+kept from being negative by themselves, so that the exact tangent is a little stiffer than the forces.
 
 Source: Bonet and Burton, A simple average nodal pressure tetrahedral element, 1998; de Souza Neto, Andrade Pires and
 Owen, F-bar-based linear triangles and tetrahedra (patches), 2005.
@@ -78,7 +82,9 @@ class StrainCellElements(Effect):
         self.elastic = world.at_start(self.elastic_in)
         parts = [cells_of(body, params) for body, params in listed]
         self.cells = joined(parts, [(body.first, len(body.tets)) for body in self.rotated])
-        self.owner = _owner(self.rotated, [len(part.volume) for part in parts])
+        counts = [len(part.volume) for part in parts]
+        self.owner = _owner(self.rotated, counts)
+        self._keeps_lambda = np.repeat([body.elements == "quadratic" for body in self.rotated], counts)
         self._patch_owner = _owner(self.rotated, [part.patches for part in parts])
         self._lay_out()
         self._follow()
@@ -115,18 +121,20 @@ class StrainCellElements(Effect):
         cells, volume = self.cells, self.cells.volume
         strained = cells.has(DEVIATOR)
 
-        def constants(scene: Scene) -> Constants:
-            """mu of the cells and kappa of the patches [Pa]."""
+        def constants(scene: Scene) -> tuple[Float64, Float64, Float64]:
+            """mu of the cells, kappa of the patches and lambda_c of the cells [Pa]."""
             young, poisson = np.concatenate([*self.elastic_in(scene).values()], axis=1)[:, cells.element]
-            kappa = np.bincount(cells.patch, self.volume * young / (3 * (1 - 2 * poisson)), cells.patches)
-            return young / (2 * (1 + poisson)), kappa / self.patch_volume
+            mu, whole = young / (2 * (1 + poisson)), young * poisson / ((1 + poisson) * (1 - 2 * poisson))
+            own = np.where(self._keeps_lambda, np.minimum(whole, mu), -2 / 3 * mu)
+            kappa = np.bincount(cells.patch, self.volume * (whole - own), cells.patches)
+            return mu, kappa / self.patch_volume, own
 
         def moduli(scene: Scene) -> Float64:
-            mu, kappa = constants(scene)
-            return np.stack([mu * volume * strained, kappa[cells.patch] * self.volume, mu * volume])
+            mu, kappa, own = constants(scene)
+            return np.stack([mu * strained, kappa[cells.patch] * cells.has(DILATATION), own * strained, mu]) * volume
 
         def share(scene: Scene) -> Float64:
-            mu, kappa = constants(scene)
+            mu, kappa, _ = constants(scene)
             return np.sqrt(kappa[cells.patch] * volume / (mu * self.patch_volume[cells.patch]))
 
         follow = self.world.follow
@@ -251,7 +259,7 @@ class StrainCellElements(Effect):
         }  # fmt: skip
 
     def energies(self) -> ElementEnergies:
-        """V mu |dev(S - I)|^2 of the cells [J]."""
+        """What the cells have by themselves [J]."""
         launch = self.world.backend.module(TEXT).bind(
             "energy", len(self.owner), nodes=self.slices.nodes, x=self.world.x, volume=self.volume,
             moduli=self.moduli, dilatation=self._energy_dilatation, energy=self._energy, **self._of_slices(),

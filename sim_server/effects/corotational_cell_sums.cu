@@ -9,7 +9,7 @@ struct CellNodes {
     const int* corners;             // (start[n],) slots of the cells at the node
     const int* owners;              // (start[n],) the cells
     const local* nodal_impulse;     // (slots, 3) [N s]
-    const local* scaled_gradients;  // (slots, 4) g_a, -2/3
+    const local* scaled_gradients;  // (slots, 4) g_a, lambda_c / mu
     const local* quaternion;        // (cells, 4) unit quaternions
     own<real> b;                    // (n, 3) in, out: right-hand side, world frame [N s]
     own<local> block;               // (n, 6) in, out: upper triangle of the node's own block of A, world frame [kg]
@@ -42,7 +42,7 @@ struct ExactCellNodes {
     const int* corners;             // (start[n],) slots of the cells at the node
     const int* owners;              // (start[n],) the cells
     const local* nodal_impulse;     // (slots, 3) [N s]
-    const local* scaled_gradients;  // (slots, 4) g_a, -2/3
+    const local* scaled_gradients;  // (slots, 4) g_a, lambda_c / mu
     const local* twist;             // (cells, 6) E
     const local* quaternion;        // (cells, 4) unit quaternions
     own<real> b;                    // (n, 3) in, out: right-hand side, world frame [N s]
@@ -91,7 +91,7 @@ struct CellBlocks {
     int accumulate;                 // 0: write, 1: add to what another effect wrote
     const int* start;               // (n + 1,) into pairs
     const int* pairs;               // (start[n], 2) slots of a cell at the block's row and column
-    const local* scaled_gradients;  // (slots, 4) g_a, -2/3
+    const local* scaled_gradients;  // (slots, 4) g_a, lambda_c / mu
     own<local> sums;                // (n, 9) out, world frame, row major [kg]
 };
 
@@ -114,7 +114,7 @@ struct ExactCellBlocks {
     const int* start;               // (n + 1,) into pairs
     const int* pairs;               // (start[n], 2) slots of a cell at the block's row and column
     const int* owners;              // (start[n],) the cells
-    const local* scaled_gradients;  // (slots, 4) g_a, -2/3
+    const local* scaled_gradients;  // (slots, 4) g_a, lambda_c / mu
     const local* twist;             // (cells, 6) E
     own<local> sums;                // (n, 9) out, world frame, row major [kg]
 };

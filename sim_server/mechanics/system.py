@@ -140,7 +140,7 @@ class System:
     def finish(self, matrix: bool = True) -> list[Launch]:
         """Takes the system into the material frame, A' = R^T A R and b' = R^T b, and sets the start of the solve.
 
-        matrix: A', too
+        matrix: A', too. Rollers (mechanics/rollers.py) come first.
         """
         w = self.world
         velocity = w.v if w.inertia else w.predictor  # without inertia v is only the last displacement over dt
@@ -150,13 +150,24 @@ class System:
             x=w.x, v=velocity, extent=self.extent, inverse_time=self.inverse_time, h=w.dt, whole=int(matrix),
             moving=self.moving, rotation=self.rotation, b_material=self.b_material, y=self.y, values=self.values,
         )  # fmt: skip
+        kept = self.keep_directions(frames=True)
         if not matrix:
-            return [rotate]
+            return [*kept, rotate]
         rotate_blocks = self.world.backend.module("kernels/rotate_blocks.cu").bind(
             "rotate_blocks", len(self.row), row=self.row, column=self.column, upper=self.upper, lower=self.lower,
             sums=self.sums, rotation=self.rotation, values=self.values,
         )  # fmt: skip
+        if w.rollers is not None:
+            own, others = w.rollers.keep_matrix(self.block, self.sums, self.row, self.column)
+            return [*kept, own, rotate, others, rotate_blocks]
         return [rotate, rotate_blocks]
+
+    def keep_directions(self, frames: bool) -> list[Launch]:
+        """Takes b to the directions in which nodes may move; nothing in a scene without rollers. frames: these, too."""
+        rollers = self.world.rollers
+        if rollers is None:
+            return []
+        return [rollers.keep_force(self.b), *([rollers.keep_frame(self.mean)] if frames else [])]
 
     def advance(self, before: Float64) -> Launch:
         """Advances by backward Euler: v += R y, x += h v. before (n, 3): gets x at the start of the step [m]."""

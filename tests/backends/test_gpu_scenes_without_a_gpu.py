@@ -151,6 +151,22 @@ def test_a_scene_with_explicit_substeps_is_built(cupy, name, precision):
     assert engine.step == 3
 
 
+@pytest.mark.parametrize(
+    ("scheme", "precision"), [("backward_euler", "mixed"), ("ros2", "float64"), ("central_difference", "float32")]
+)
+def test_rollers_and_loads_on_surfaces_are_built(cupy, scheme, precision):
+    """Their launches join the kernels over elements, nodes and blocks."""
+    given = bar((2, 1, 1), fixed="X < 0.01")
+    given["effects"]["fixed"] = [{"where": "X < 0.01"}, {"where": "Y < 0.01", "along": "y"}]
+    given["effects"]["traction"] = {"where": "X > 1.99", "force": [1, 0, 0], "pressure": 2.0, "moment": [0, 1, 0]}
+    sim = Simulation(scene(given, integrator={"scheme": scheme}, precision=precision), "gpu")
+    sim.engine.run(3)
+    assert sim.engine.step == 3
+    names = "+".join(x.name for x in sim.step_launches)
+    assert "traction.areas" in names and "traction.load" in names and "rollers.keep_force" in names
+    assert ("roller_blocks.keep_blocks" in names) == (scheme != "central_difference")
+
+
 @pytest.mark.parametrize("scheme", ["backward_euler", "central_difference"])
 def test_parameters_are_copied_into_the_arrays_of_the_device(cupy, scheme):
     """And of the type that these have there; what makes work of the elastic energy compiles and is launched around."""

@@ -43,7 +43,8 @@ def effect_of(sim: Simulation) -> StrainCellElements:
 
 def reference(sim: Simulation) -> CellSolid:
     effect = effect_of(sim)
-    return CellSolid(effect.cells, *effect.elastic[0])
+    points = sim.world.bodies[0].elements == "quadratic"
+    return CellSolid(effect.cells, *effect.elastic[0], points)
 
 
 def forces(sim: Simulation) -> NDArray:

@@ -78,7 +78,7 @@ def model(name: str, tets: int, device: str = "cpu", precision: str = "float64",
     assert effect(key).SCOPE == "object"
     beam = {
         "name": "beam",
-        "mesh": {"bar": list(BARS[tets]), "size": [1.0, 1.0, 4.0]},
+        "mesh": {"bar": list(BARS[tets]), "size": [1.0, 1.0, 4.0], "split": "kuhn"},
         "effects": {key: table, **BESIDE.get(key, {})},
     }
     solver = {"preconditioner": "none", "precision": precision, **solver}
