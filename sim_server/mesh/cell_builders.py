@@ -26,30 +26,29 @@ def tetrahedron_cells(rest: Float64, tets: Int32, region: Int32) -> StrainCells:
 
 
 def edge_cells(rest: Float64, tets: Int32, region: Int32) -> StrainCells:
-    """A cell around each edge, of a sixth of each tetrahedron at it, for the deviator; behind them `tetrahedron_cells`,
-    whose patches have the dilatation, since patches of edges would couple twice as many nodes.
+    """A cell around each edge, of a sixth of each tetrahedron at it, for the deviator; behind them one of each patch of
+    tetrahedra for the dilatation, since patches of edges would couple twice as many nodes.
 
     An edge between regions has a cell in each. region (m,): of each tetrahedron
     """
     volume, gradients = _all_gradients(rest, tets)
-    share, tet_of = np.repeat(volume / 6, 6), np.repeat(np.arange(len(tets)), 6)
+    patch, m = patches(rest, tets, region), len(tets)
     ends = np.sort(tets[:, EDGES].reshape(-1, 2), axis=1).astype(np.int64)
-    keys = np.concatenate([ends, region[tet_of, None]], axis=1)
-    _, first, cell = np.unique(keys, axis=0, return_index=True, return_inverse=True)
-    cell, cells = cell.ravel(), len(first)
-    total: Float64 = np.bincount(cell, share, cells).astype(np.float64)
+    keys = np.concatenate([ends, np.repeat(region, 6)[:, None]], axis=1)
+    edge = np.unique(keys, axis=0, return_inverse=True)[1].ravel()
+    edges = int(edge.max(initial=-1)) + 1
+    cell = np.concatenate([edge, edges + patch])  # of 6 parts of each tetrahedron, and of all of it
+    tet_of = np.concatenate([np.repeat(np.arange(m), 6), np.arange(m)])
+    share = np.concatenate([np.repeat(volume / 6, 6), volume])
+    numbers, first = np.unique(cell, return_index=True)
+    total, element = np.bincount(cell, share).astype(np.float64), tet_of[first].astype(np.int32)
     pairs, place = np.unique(cell[:, None] * len(rest) + tets[tet_of], return_inverse=True)
     weighted = (share / total[cell])[:, None, None] * gradients[tet_of]
     summed = [np.bincount(place.ravel(), weighted[:, :, k].ravel(), len(pairs)) for k in range(3)]
-    start = np.searchsorted(pairs, np.arange(cells + 1) * len(rest)).astype(np.int32)
-    of = tetrahedron_cells(rest, tets, region)
-    element = tet_of[first].astype(np.int32)
+    start = np.searchsorted(pairs, np.arange(len(total) + 1) * len(rest)).astype(np.int32)
     return StrainCells(
-        np.concatenate([start, start[-1] + of.start[1:]]),
-        np.concatenate([(pairs % len(rest)).astype(np.int32), of.nodes]),
-        np.concatenate([np.stack(summed, axis=1), of.gradients]), np.concatenate([total, of.volume]),
-        np.concatenate([element, of.element]), np.concatenate([of.patch[element], of.patch]),
-        np.repeat(np.array([DEVIATOR, DILATATION], np.int32), [cells, len(tets)]),
+        start, (pairs % len(rest)).astype(np.int32), np.stack(summed, axis=1), total, element, patch[element],
+        np.where(numbers < edges, DEVIATOR, DILATATION).astype(np.int32),
     )  # fmt: skip
 
 
