@@ -22,8 +22,9 @@ and the usual tangent, with R held, is that of the cells and one matrix of rank 
 with g_p,a = sum_c V R G_a / V_p, positive semi-definite as it is. The exact one adds the twists of each cell, as in
 corotational.py with the pressure p = kappa theta_p + lambda_c tr(S - I) in the place of lambda tr(S - I).
 
-Of `smoothed` elements edges have the deviators and tetrahedra theta_p (mesh/cell_builders.py). The twists of each are
-kept from being negative by themselves, so that the exact tangent is a little stiffer than the forces.
+Of `smoothed` elements cells around edges have the deviators, and theta_p is of one cell that is the whole patch
+(mesh/cell_builders.py). The twists of each are kept from being negative by themselves, so that the exact tangent is a
+little stiffer than the forces.
 
 Source: Bonet and Burton, A simple average nodal pressure tetrahedral element, 1998; de Souza Neto, Andrade Pires and
 Owen, F-bar-based linear triangles and tetrahedra (patches), 2005.

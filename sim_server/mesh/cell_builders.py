@@ -40,7 +40,7 @@ def edge_cells(rest: Float64, tets: Int32, region: Int32) -> StrainCells:
     cell = np.concatenate([edge, edges + patch])  # of 6 parts of each tetrahedron, and of all of it
     tet_of = np.concatenate([np.repeat(np.arange(m), 6), np.arange(m)])
     share = np.concatenate([np.repeat(volume / 6, 6), volume])
-    numbers, first = np.unique(cell, return_index=True)
+    first = np.unique(cell, return_index=True)[1]
     total, element = np.bincount(cell, share).astype(np.float64), tet_of[first].astype(np.int32)
     pairs, place = np.unique(cell[:, None] * len(rest) + tets[tet_of], return_inverse=True)
     weighted = (share / total[cell])[:, None, None] * gradients[tet_of]
@@ -48,7 +48,7 @@ def edge_cells(rest: Float64, tets: Int32, region: Int32) -> StrainCells:
     start = np.searchsorted(pairs, np.arange(len(total) + 1) * len(rest)).astype(np.int32)
     return StrainCells(
         start, (pairs % len(rest)).astype(np.int32), np.stack(summed, axis=1), total, element, patch[element],
-        np.where(numbers < edges, DEVIATOR, DILATATION).astype(np.int32),
+        np.where(np.arange(len(total)) < edges, DEVIATOR, DILATATION).astype(np.int32),
     )  # fmt: skip
 
 
