@@ -116,7 +116,7 @@ def stiffness_of_an_arc(layers: int, angle: float) -> float:
     bending = 1e5 * size[1] * size[2] ** 3 / 12
     fixed = [{"where": "X < 0.001", "along": "x"}, {"where": "true", "along": "y"},
              {"where": "X < 0.001 and abs(Z - 0.05) < 0.001", "along": "z"}]  # fmt: skip
-    steps, moment = 4, bending * angle
+    steps, moment = 8, bending * angle
     sim = loaded(
         {"where": "X > 0.999", "moment": [0, moment / steps, 0]}, {"scheme": "quasi_static"}, fixed,
         cells=(10 * layers, 1, layers), size=size, poisson=0.0, tangent="exact",
@@ -125,7 +125,7 @@ def stiffness_of_an_arc(layers: int, angle: float) -> float:
     driver = Driver(sim)
     for k in range(1, steps + 1):
         sim.parameters.set({"bar.traction.moment": str([0, moment * k / steps, 0])})
-        driver.advance(15)
+        driver.advance(40)
     rest, x = sim.world.rest, sim.fetch().x
     low, high = (x[(rest[:, 0] > 0.999) & (abs(rest[:, 2] - z) < 1e-6)].mean(axis=0) for z in (0, 0.1))
     across = high - low

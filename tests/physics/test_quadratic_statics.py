@@ -5,8 +5,15 @@ import numpy as np
 import pytest
 
 from sim_server.mesh import bar
-from tests.bench.verification.locking import SAG, SIZE
-from tests.reference.quadratic_statics import body_force, displacements, face_shares, gradients, with_mid_nodes
+from tests.reference.quadratic_statics import (
+    SAG,
+    SIZE,
+    body_force,
+    displacements,
+    face_shares,
+    gradients,
+    with_mid_nodes,
+)
 from tests.scenes import jittered_bar
 
 

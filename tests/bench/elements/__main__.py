@@ -37,8 +37,8 @@ go from horizontal under gravity. *mirrored*: n x n x 4n cells of six tetrahedra
 Quadratic elements have as many, with mid-nodes. Scheme ros2 with steps of 10 ms; factors by lockstep-4, made between
 the steps and not counted: of a server, a worker on another core makes them. Error: root mean square over time of the
 distance of the four corners of the free face from where they are with {finest} x {finest} x {four} cells of quadratic
-elements, over the length. ms a step: processor time of the loop, median over the steps and the rounds, in which kinds
-take turns."""
+elements, over the length. ms a step: of a CPU the processor time of the loop, of a GPU the time of the device, median
+over the steps and the rounds, in which kinds take turns."""
 
 
 def meshes(quick: bool) -> dict[str, dict[str, list[str]]]:
@@ -61,8 +61,9 @@ def _box(tets: int) -> str:
 
 @dataclass
 class Run:
-    """A kind of elements on one mesh at one Poisson's ratio, over rounds."""
+    """A kind of elements on one mesh at one Poisson's ratio on a device, over rounds."""
 
+    device: str
     poisson: float
     family: str
     kind: str
@@ -77,6 +78,7 @@ class Run:
     def table(self) -> dict[str, Any]:
         low, high = min(self.milliseconds), max(self.milliseconds)
         return {
+            "device": self.device,
             "ν": self.poisson, "mesh": self.family, "elements": self.kind, "tets": self.tets, "nodes": self.nodes,
             "blocks a row": self.blocks / self.nodes,
             "ms a step": float(np.median(self.milliseconds)), "range": f"{low:.3g} … {high:.3g}",
@@ -84,38 +86,44 @@ class Run:
         }  # fmt: skip
 
 
-def motion(kind: str, mesh: str, poisson: float, steps: int) -> tuple[Simulation, Any, NDArray[np.float64]]:
+def motion(
+    kind: str, mesh: str, poisson: float, steps: int, device: str = "cpu"
+) -> tuple[Simulation, Any, NDArray[np.float64]]:
     """Returns the simulation, the records and the paths of the corners of the free face, (steps, 4, 3) [m]."""
     law = f"{{ young = 1e6, poisson = {poisson} }}"
     sim = Simulation.load(SCENES / "beam.toml", [
         f"object.beam.mesh={mesh}", f"object.beam.elements={kind}", f"object.beam.effects.corotational={law}",
         "dt=0.01", "integrator.scheme=ros2", "solver.preconditioner=cholesky", "solver.update=lockstep-4",
-    ])  # fmt: skip
+    ], device)  # fmt: skip
     rest, corners = sim.world.rest, [(x, y, LENGTH) for x in (0.0, 1.0) for y in (0.0, 1.0)]
     at = [int(np.abs(rest - point).sum(axis=1).argmin()) for point in corners]
     assert np.allclose(rest[at], corners)
     driver, records, paths = Driver(sim), [], []
     for _ in range(steps):
         records.append(driver.advance(1))
-        paths.append(sim.world.x[at].copy())
+        paths.append(sim.fetch().x[at].copy())
     return sim, np.concatenate(records), np.array(paths)
 
 
-def measure(poisson: float, finest: int, steps: int, rounds: int, quick: bool) -> list[Run]:
-    """Runs of all kinds and meshes at one Poisson's ratio."""
+def measure(poisson: float, finest: int, steps: int, rounds: int, devices: list[str], quick: bool) -> list[Run]:
+    """Runs of all kinds and meshes on all devices at one Poisson's ratio."""
     exact = motion("quadratic", _bar(finest), poisson, steps)[2]
     families = meshes(quick).items()
-    runs = [Run(poisson, name, kind, mesh) for name, each in families for kind, of in each.items() for mesh in of]
+    runs = [
+        Run(device, poisson, name, kind, mesh)
+        for device in devices for name, each in families for kind, of in each.items() for mesh in of
+    ]  # fmt: skip
     for run in [run for _ in range(rounds) for run in runs]:
-        sim, records, paths = motion(run.kind, run.mesh, poisson, steps)
+        sim, records, paths = motion(run.kind, run.mesh, poisson, steps, run.device)
         mesh = sim.world.bodies[0].mesh
         run.tets, run.nodes = len(mesh.tets if mesh.quadratic is None else mesh.quadratic), sim.world.nodes
         run.blocks = len(sim.system.columns)
-        run.milliseconds.append(1e3 * float(np.median(records["cpu"])))
+        run.milliseconds.append(1e3 * float(np.median(records["cpu" if run.device == "cpu" else "whole"])))
         run.iterations = float(records["iterations"].mean())
         run.error = float(np.sqrt(((paths - exact) ** 2).sum(axis=2).mean())) / LENGTH
         print(
-            f"nu {poisson}, {run.family}, {run.kind} {run.tets}: {run.milliseconds[-1]:.3g} ms, error {run.error:.1e}",
+            f"{run.device}, nu {poisson}, {run.family}, {run.kind} {run.tets}: {run.milliseconds[-1]:.3g} ms, "
+            f"error {run.error:.1e}",
             flush=True,
         )
     return runs
@@ -134,12 +142,15 @@ def time_at(runs: Iterable[Run], wanted: float) -> float | None:
 
 
 def answers(runs: list[Run]) -> list[dict[str, Any]]:
-    """By mesh and Poisson's ratio, what a step takes with each kind at the error wanted."""
+    """By device, mesh and Poisson's ratio, what a step takes with each kind at the error wanted."""
     found = []
-    for family, poisson in dict.fromkeys((run.family, run.poisson) for run in runs):
-        here = [run for run in runs if (run.family, run.poisson) == (family, poisson)]
+    for where in dict.fromkeys((run.device, run.family, run.poisson) for run in runs):
+        here = [run for run in runs if (run.device, run.family, run.poisson) == where]
+        device, family, poisson = where
         times = {kind: time_at([run for run in here if run.kind == kind], WANTED) for kind in CELLS}
-        line: dict[str, Any] = {"mesh": family, "ν": poisson, **{f"{kind}, ms": t for kind, t in times.items()}}
+        line: dict[str, Any] = {
+            "device": device, "mesh": family, "ν": poisson, **{f"{kind}, ms": t for kind, t in times.items()},
+        }  # fmt: skip
         best = min(((t, kind) for kind, t in times.items() if t is not None), default=(math.nan, "none"))
         slowest = max((float(np.median(run.milliseconds)) for run in here if run.kind == "linear"), default=math.nan)
         linear, line["cheapest"] = times["linear"], best[1]
@@ -174,6 +185,7 @@ def diagram(runs: list[Run]) -> Any:
 def main(
     end: Annotated[float, typer.Option(help="Simulated time of each run [s]")] = 1.0,
     rounds: Annotated[int, typer.Option(min=1, help="Repetitions, the kinds taking turns")] = 3,
+    gpu: Annotated[bool, typer.Option("--gpu", help="On a GPU, too")] = False,
     quick: Annotated[bool, typer.Option("--quick", help="A small smoke run")] = False,
     out: Annotated[Path | None, typer.Option(help="Folder of the results [default: out/bench/elements]")] = None,
 ) -> None:
@@ -182,16 +194,20 @@ def main(
     finest, ratios = FINEST, [0.3, 0.45, 0.49, 0.499]
     if quick:
         finest, ratios, end, rounds = 2, [0.45], 0.1, 1
+    devices = ["cpu", "gpu"] if gpu else ["cpu"]
     report = Report("elements", "Kinds of elements", {"end": end, "rounds": rounds}, out, quick)
-    runs = [run for poisson in ratios for run in measure(poisson, finest, round(end / 0.01), rounds, quick)]
+    runs = [run for poisson in ratios for run in measure(poisson, finest, round(end / 0.01), rounds, devices, quick)]
     report.say(HOW.format(finest=finest, four=4 * finest))
     report.say(f"## Time of a step at an error of {100 * WANTED:g} %", "Between meshes, on a line of logarithms.")
     report.table(answers(runs))
-    report.figure(diagram(runs), "elements.png", "Error of the motion against the time of a step.")
+    for device in devices:
+        picture = diagram([run for run in runs if run.device == device])
+        report.figure(picture, f"elements_{device}.png", f"Error of the motion against the time of a step, {device}.")
     report.say("## All runs")
     report.table([run.table() for run in runs])
     report.data["runs"] = [vars(run) for run in runs]
-    report.remember([run.table() for run in runs if run.poisson == 0.45], ("mesh", "elements", "tets"), ("ms a step",))
+    kept = [run.table() for run in runs if run.poisson == 0.45]
+    report.remember(kept, ("device", "mesh", "elements", "tets"), ("ms a step",))
     report.write()
 
 

@@ -20,16 +20,12 @@ from sim_server.scene.elements import Kind
 from sim_server.simulation import Simulation
 from tests.bench.verification.loads import settle, static_scene
 from tests.bench.verification.row import Row, relative
-from tests.reference.quadratic_statics import Mesh10, with_mid_nodes
+from tests.reference.quadratic_statics import SAG, SIZE, Mesh10, with_mid_nodes
 
 Reals = NDArray[np.float64]
 MESHES = Path(__file__).parent / "meshes"
-CELLS, SIZE = (5, 5, 20), (1.0, 1.0, 4.0)
+CELLS = (5, 5, 20)
 YOUNG, DENSITY, GRAVITY = 1e6, 1000.0, 1e-4  # small: nothing but Hooke's law
-SAG = {0.3: 400.8, 0.45: 391.9, 0.49: 388.3, 0.499: 387.4, 0.4999: 387.3}
-"""Of the free face, mean over its nodes, over force per volume / Young's modulus, by Poisson's ratio: the middle of
-24,000 quadratic tetrahedra in displacement form and with a mean dilatation in each, 0.7 % apart at most
-(tests/reference/quadratic_statics.py, bar 10 x 10 x 40)."""
 SOURCE = "quadratic tetrahedra, 24,000, apart (tests/reference/quadratic_statics.py)"
 UNKNOWN = (InputError, ValidationError)  # what a version says of elements and effects that it does not have
 MOST = {"linear": 0.95, "patch": 0.3, "smoothed": 0.1, "quadratic": 0.1}  # of the sag, lost or too much
