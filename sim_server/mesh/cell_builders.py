@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Strain cells of linear tetrahedra: each by itself, or smoothed over edges.
+"""Strain cells of linear tetrahedra: each by itself, or smoothed over edges, and over patches for the dilatation.
 
 Source: Bonet and Burton 1998 (averaged dilatation of linear tetrahedra); Nguyen-Thoi, Liu, Lam and Zhang 2009
 (smoothing over faces of tetrahedra; here over edges); numbers of nodes and tetrahedra are those of the mesh.
@@ -27,7 +27,8 @@ def tetrahedron_cells(rest: Float64, tets: Int32, region: Int32) -> StrainCells:
 
 def edge_cells(rest: Float64, tets: Int32, region: Int32) -> StrainCells:
     """A cell around each edge, of a sixth of each tetrahedron at it, for the deviator; behind them one of each patch of
-    tetrahedra for the dilatation, since patches of edges would couple twice as many nodes.
+    tetrahedra for the dilatation, since patches of edges would couple twice as many nodes. One, not one of
+    each tetrahedron: less to compute, and on the linear theory the same.
 
     An edge between regions has a cell in each. region (m,): of each tetrahedron
     """
