@@ -22,6 +22,10 @@ and the usual tangent, with R held, is that of the cells and one matrix of rank 
 with g_p,a = sum_c V R G_a / V_p, positive semi-definite as it is. The exact one adds the twists of each cell, as in
 corotational.py with the pressure p = kappa theta_p + lambda_c tr(S - I) in the place of lambda tr(S - I).
 
+Of `smoothed` elements cells around edges have the deviators, and theta_p is of one cell that is the whole patch
+(mesh/cell_builders.py). The twists of each are kept from being negative by themselves, so that the exact tangent is a
+little stiffer than the forces.
+
 Source: Bonet and Burton, A simple average nodal pressure tetrahedral element, 1998; de Souza Neto, Andrade Pires and
 Owen, F-bar-based linear triangles and tetrahedra (patches), 2005.
 """
@@ -43,7 +47,7 @@ from sim_server.mechanics.system import Stencil, System
 from sim_server.mechanics.world import Body, World
 from sim_server.mesh.cell_builders import edge_cells, tetrahedron_cells
 from sim_server.mesh.quadratic_cells import quadratic_cells
-from sim_server.mesh.strain_cells import StrainCells, joined
+from sim_server.mesh.strain_cells import DEVIATOR, DILATATION, StrainCells, joined
 from sim_server.scene import Scene
 from sim_server.scene.regions import region_numbers
 
@@ -99,31 +103,36 @@ class StrainCellElements(Effect):
         """Makes slices, patches and the lists of both."""
         cells = self.cells
         self.slices = sliced(cells.start, cells.nodes, cells.gradients)
-        clusters = self.slices.clusters
+        strained, dilating = cells.has(DEVIATOR), cells.has(DILATATION)
+        clusters = self.slices.clusters.taken(dilating)
         patches, start, corners = united(clusters, cells.patch, cells.patches)
-        self._coupled = PatchedCells(clusters, patches)
+        alone = self.slices.clusters.taken(dilating & ~strained)
+        self._coupled = PatchedCells(self.slices.clusters.taken(strained), patches, alone)
         self._corners = Lists(start, clusters.owner[corners], clusters.slots[corners])
-        order = np.argsort(cells.patch, kind="stable").astype(np.int32)
+        members = np.flatnonzero(dilating)
+        order = members[np.argsort(cells.patch[members], kind="stable")].astype(np.int32)
         begin = np.searchsorted(cells.patch[order], np.arange(cells.patches + 1)).astype(np.int32)
         self._members = Lists(begin, order, np.zeros(0, np.int32))
-        self.patch_volume = np.bincount(cells.patch, cells.volume, cells.patches)
+        self.volume = cells.volume * dilating
+        self.patch_volume = np.bincount(cells.patch, self.volume, cells.patches)
         self.inverse_volume = 1 / self.patch_volume
 
     def _follow(self) -> None:
         """Makes the arrays that follow the material constants."""
         cells, volume = self.cells, self.cells.volume
+        strained = cells.has(DEVIATOR)
 
         def constants(scene: Scene) -> tuple[Float64, Float64, Float64]:
             """mu of the cells, kappa of the patches and lambda_c of the cells [Pa]."""
             young, poisson = np.concatenate([*self.elastic_in(scene).values()], axis=1)[:, cells.element]
             mu, whole = young / (2 * (1 + poisson)), young * poisson / ((1 + poisson) * (1 - 2 * poisson))
             own = np.where(self._keeps_lambda, np.minimum(whole, mu), -2 / 3 * mu)
-            kappa = np.bincount(cells.patch, volume * (whole - own), cells.patches)
+            kappa = np.bincount(cells.patch, self.volume * (whole - own), cells.patches)
             return mu, kappa / self.patch_volume, own
 
         def moduli(scene: Scene) -> Float64:
             mu, kappa, own = constants(scene)
-            return np.stack([mu * volume, kappa[cells.patch] * volume, own * volume])
+            return np.stack([mu * strained, kappa[cells.patch] * cells.has(DILATATION), own * strained, mu]) * volume
 
         def share(scene: Scene) -> Float64:
             mu, kappa, _ = constants(scene)
@@ -139,7 +148,7 @@ class StrainCellElements(Effect):
 
     @property
     def element_nodes(self) -> list[Int32]:
-        cells, patches = self._coupled.cells, self._coupled.patches
+        cells, patches = self.slices.clusters, self._coupled.patches
         return [cells.nodes[cells.start[:-1]], patches.nodes[patches.start[:-1]], patches.nodes]
 
     def rows_of_bodies(self, array: NDArray[Any]) -> Callable[[int], Any] | None:
@@ -181,7 +190,27 @@ class StrainCellElements(Effect):
             "blocks", len(system.sums), start=patches.pair_start, pairs=patches.pairs,
             patch_gradients=self.patch_gradients, sums=system.sums,
         )  # fmt: skip
-        return [*self._measured("measure", self.quaternion), elements, gradients, gather, own, blocks, of_patches]
+        forces = [*self._measured("measure", self.quaternion), elements, gradients, gather]
+        return [*forces, own, blocks, of_patches, *self._of_dilating(system, stencil.dilating, exact)]
+
+    def _of_dilating(self, system: System, stencil: Stencil | None, exact: bool) -> list[Launch]:
+        """Returns the gathers of cells that have a dilatation alone."""
+        if stencil is None:
+            return []
+        w, lists = self.world, {"start": stencil.corner_start, "corners": stencil.corners}
+        if not exact:
+            module = w.backend.module("effects/corotational_nodes.cu")
+            return [module.bind("gather_impulses", w.nodes, nodal_impulse=self.nodal_impulse, b=system.b, **lists)]
+        sums, twist = w.backend.module(SUMS), {"twist": self.twist, "scaled_gradients": self.scaled_gradients}
+        gather = sums.bind(
+            "gather_twists", w.nodes, owners=stencil.corner_owners, nodal_impulse=self.nodal_impulse, b=system.b,
+            block=system.block, **lists, **twist,
+        )  # fmt: skip
+        blocks = sums.bind(
+            "twist_blocks", len(system.sums), start=stencil.pair_start, pairs=stencil.pairs,
+            owners=stencil.pair_owners, sums=system.sums, **twist,
+        )  # fmt: skip
+        return [gather, blocks]
 
     def force_launches(self, system: System, stencil: Stencil | None, frames: bool) -> list[Launch] | None:
         assert stencil is not None
@@ -200,13 +229,14 @@ class StrainCellElements(Effect):
             gather = w.backend.module("effects/corotational_nodes.cu").bind(
                 "gather_impulses", w.nodes, b=system.b, **lists
             )  # fmt: skip
-        return [*self._measured("measure_near", self.near), impulses, gather]
+        others = self._of_dilating(system, stencil.dilating, exact=False)
+        return [*self._measured("measure_near", self.near), impulses, gather, *others]
 
     def _measured(self, kernel: str, quaternion: Float64) -> list[Launch]:
         """Returns the launches up to the mean dilatations."""
         w = self.world
         measure = w.backend.module(TEXT).bind(
-            kernel, len(self.owner), nodes=self.slices.nodes, x=w.x, v=w.damping_velocity, volume=self.cells.volume,
+            kernel, len(self.owner), nodes=self.slices.nodes, x=w.x, v=w.damping_velocity, volume=self.volume,
             quaternion=quaternion, strain=self.strain, dilatation=self.dilatation, **self._of_slices(),
         )  # fmt: skip
         means = w.backend.module(PATCHES).bind(
@@ -232,7 +262,7 @@ class StrainCellElements(Effect):
     def energies(self) -> ElementEnergies:
         """What the cells have by themselves [J]."""
         launch = self.world.backend.module(TEXT).bind(
-            "energy", len(self.owner), nodes=self.slices.nodes, x=self.world.x, volume=self.cells.volume,
+            "energy", len(self.owner), nodes=self.slices.nodes, x=self.world.x, volume=self.volume,
             moduli=self.moduli, dilatation=self._energy_dilatation, energy=self._energy, **self._of_slices(),
         )  # fmt: skip
         return ElementEnergies(launch, self._energy, self.owner)

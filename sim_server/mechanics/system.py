@@ -30,7 +30,8 @@ class Stencil:
     pair_start (blocks above the diagonal + 1,), pairs (k,): c^2 e + c a + b, the corners of e that couple in a block.
 
     Of strain cells with any number of nodes (clusters.py) corners are their slots, pairs (k, 2) the slots that couple;
-    corner_owners, pair_owners: the cell of each; patches: the same of their patches.
+    corner_owners, pair_owners: the cell of each; patches: the same of their patches; dilating: of cells that have a
+    dilatation alone, None if there are none.
     """
 
     corner_start: Int32
@@ -40,6 +41,7 @@ class Stencil:
     corner_owners: Int32 | None = None
     pair_owners: Int32 | None = None
     patches: "Stencil | None" = None
+    dilating: "Stencil | None" = None
 
 
 class System:
@@ -216,15 +218,15 @@ def _couplings(elements: Int32, world: World, n: int) -> tuple[Int64, Int32]:
     return np.concatenate(keys), np.concatenate(pairs)
 
 
-def _patched(elements: PatchedCells, world: World) -> tuple[Couplings, Couplings]:
-    return clusters.couplings(elements.cells, world), clusters.couplings(elements.patches, world)
+def _patched(elements: PatchedCells, world: World) -> list[Couplings]:
+    return [clusters.couplings(each, world) for each in (elements.cells, elements.patches, elements.dilating)]
 
 
-def _patched_stencil(
-    elements: PatchedCells, found: tuple[Couplings, Couplings], n: int, blocks: Int64
-) -> Stencil:  # fmt: skip
-    patches = Stencil(*clusters.places(elements.patches, found[1], n, blocks))
-    return Stencil(*clusters.places(elements.cells, found[0], n, blocks), patches)
+def _patched_stencil(elements: PatchedCells, found: list[Couplings], n: int, blocks: Int64) -> Stencil:
+    groups = elements.cells, elements.patches, elements.dilating
+    cells, patches, dilating = (clusters.places(g, f, n, blocks) for g, f in zip(groups, found, strict=True))
+    alone = Stencil(*dilating) if len(elements.dilating.nodes) else None
+    return Stencil(*cells, Stencil(*patches), alone)
 
 
 def _stencil(elements: Int32, couplings: tuple[Int64, Int32], n: int, blocks: Int64) -> Stencil:

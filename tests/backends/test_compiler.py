@@ -316,12 +316,14 @@ CELL_NODES = [
     ("effects/corotational_cell_sums.cu", "CellNodes", "corotational_cell_sums.gather"),
     ("effects/corotational_cell_sums.cu", "ExactCellNodes", "corotational_cell_sums.gather_exact"),
     ("effects/corotational_patches.cu", "PatchNodes", "corotational_patches.own_blocks"),
+    ("effects/corotational_cell_sums.cu", "TwistNodes", "corotational_cell_sums.gather_twists"),
     *NODES[-1:],
 ]
 CELL_BLOCKS = [
     ("effects/corotational_cell_sums.cu", "CellBlocks", "corotational_cell_sums.blocks"),
     ("effects/corotational_cell_sums.cu", "ExactCellBlocks", "corotational_cell_sums.blocks_exact"),
     ("effects/corotational_patches.cu", "PatchBlocks", "corotational_patches.blocks"),
+    ("effects/corotational_cell_sums.cu", "TwistBlocks", "corotational_cell_sums.twist_blocks"),
     ("kernels/rotate_blocks.cu", "RotateBlocks", "rotate_blocks.rotate_blocks"),
 ]
 LAW_ELEMENTS = [

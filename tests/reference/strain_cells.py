@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_server.mesh.strain_cells import StrainCells
+from sim_server.mesh.strain_cells import DEVIATOR, DILATATION, StrainCells
 from tests.reference.corotational import nearest_rotation
 
 Array = NDArray[np.float64]
@@ -31,7 +31,12 @@ class CellSolid:
     @property
     def mu(self) -> Array:
         """Of the cells [Pa]."""
-        return (self.young / (2 * (1 + self.poisson)))[self.cells.element]
+        return (self.young / (2 * (1 + self.poisson)))[self.cells.element] * self.cells.has(DEVIATOR)
+
+    @property
+    def volume(self) -> Array:
+        """Of the cells, as far as they have a dilatation [m3]."""
+        return self.cells.volume * self.cells.has(DILATATION)
 
     @property
     def own(self) -> Array:
@@ -41,13 +46,13 @@ class CellSolid:
 
     @property
     def patch_volume(self) -> Array:
-        return np.bincount(self.cells.patch, self.cells.volume)
+        return np.bincount(self.cells.patch, self.volume)
 
     @property
     def kappa(self) -> Array:
         """Of the patches [Pa]."""
         of_cells = (self.young / (3 * (1 - 2 * self.poisson)))[self.cells.element] - 2 / 3 * self.mu - self.own
-        return np.bincount(self.cells.patch, of_cells * self.cells.volume) / self.patch_volume
+        return np.bincount(self.cells.patch, of_cells * self.volume) / self.patch_volume
 
     def of(self, c: int) -> tuple[NDArray, Array]:
         """Nodes and gradients of a cell."""
@@ -64,7 +69,7 @@ class CellSolid:
         """Of the patches [-]."""
         cells = self.cells
         trace = np.array([np.trace(self.polar(x, c)[1]) - 3 for c in range(len(cells.volume))])
-        return np.bincount(cells.patch, cells.volume * trace) / self.patch_volume
+        return np.bincount(cells.patch, self.volume * trace) / self.patch_volume
 
     def energy(self, x: Array) -> float:
         total = 0.5 * (self.kappa * self.patch_volume * self.theta(x) ** 2).sum()
@@ -79,11 +84,12 @@ class CellSolid:
         for c, (V, mu, p) in enumerate(zip(self.cells.volume, self.mu, self.cells.patch, strict=True)):
             (nodes, g), (R, S) = self.of(c), self.polar(x, c)
             E = S - np.eye(3)
-            f[nodes] -= V * g @ (R @ (2 * mu * E + (kappa[p] * theta[p] + own[c] * np.trace(E)) * np.eye(3))).T
+            pressure = kappa[p] * theta[p] * (self.volume[c] > 0) + own[c] * np.trace(E)
+            f[nodes] -= V * g @ (R @ (2 * mu * E + pressure * np.eye(3))).T
         return f
 
-    def tangent(self, x: Array, exact: bool) -> Array:
-        """-df/dx with R held, or, if exact, turning as far as K stays definite; (3 n, 3 n)."""
+    def tangent(self, x: Array, exact: bool, least: float = 0.0) -> Array:
+        """-df/dx with R held, or, if exact, turning, with eigenvalues of the twists not below least; (3 n, 3 n)."""
         K, theta, kappa, own = np.zeros((x.size, x.size)), self.theta(x), self.kappa, self.own
         g_p = np.zeros((self.cells.patches, x.size))
         for c, (V, mu, p) in enumerate(zip(self.cells.volume, self.mu, self.cells.patch, strict=True)):
@@ -98,12 +104,12 @@ class CellSolid:
             sym = _symmetric_part(R)
             H = 2 * mu * sym.T @ sym + own[c] * np.outer(r, r)
             if exact:
-                pressure = kappa[p] * theta[p] + own[c] * (s.sum() - 3)
+                pressure = kappa[p] * theta[p] * (self.volume[c] > 0) + own[c] * (s.sum() - 3)
                 for a, b in ((0, 1), (1, 2), (0, 2)):
                     t = (np.outer(U[:, a], Vt[b]) - np.outer(U[:, b], Vt[a])).ravel() / np.sqrt(2)
-                    H += max(2 * mu + (pressure - 2 * mu) * 2 / (s[a] + s[b]), 0.0) * np.outer(t, t)
+                    H += max(2 * mu + (pressure - 2 * mu) * 2 / (s[a] + s[b]), least) * np.outer(t, t)
             K[np.ix_(dofs, dofs)] += V * dF.T @ H @ dF
-            g_p[p, dofs] += V * (r @ dF)
+            g_p[p, dofs] += self.volume[c] * (r @ dF)
         for p, row in enumerate(g_p):
             K += kappa[p] / self.patch_volume[p] * np.outer(row, row)
         return K
