@@ -58,7 +58,7 @@ def _nearly_incompressible(simulation: Simulation) -> dict[int, float]:
 
 
 def _remedy(o: SceneObject, simulation: Simulation) -> str:
-    patches = not list(element_errors([o.model_copy(update={"elements": "patch"})], simulation.scene.integrator))
-    ways = ['elements = "patch" does not lock'] if patches else []
+    others = not list(element_errors([o.model_copy(update={"elements": "smoothed"})], simulation.scene.integrator))
+    ways = ['elements = "smoothed" does not lock'] if others else []
     ways += ['split = "mirrored" locks less'] if o.mesh.split == "kuhn" else []
     return ", ".join(ways) or "a finer mesh locks less"

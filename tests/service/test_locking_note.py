@@ -26,7 +26,7 @@ def test_objects_alike_have_one_line():
     bodies = [bar(name=f"b{k}", mesh=KUHN, poisson=0.49) for k in range(5)]
     assert noted(bar(name="soft", mesh=KUHN, poisson=0.45), *bodies) == [
         "objects 'b0', 'b1', 'b2' and 2 more with a Poisson's ratio of 0.49 and linear tetrahedra (split = \"kuhn\"), "
-        'which lock: a beam five of them thick bends about 60 % too little; elements = "patch" does not lock, '
+        'which lock: a beam five of them thick bends about 60 % too little; elements = "smoothed" does not lock, '
         'split = "mirrored" locks less'
     ]
 
@@ -46,7 +46,7 @@ def test_the_largest_ratio_of_regions_counts():
     assert "ratio of 0.48 " in line
 
 
-def test_laws_have_no_patches():
+def test_laws_have_no_other_elements():
     o = bar(mesh=MIRRORED, young=None)
     o["effects"]["neo_hookean"] = {"young": 1e5, "poisson": 0.48}
     [line] = noted(o)
