@@ -173,3 +173,9 @@ def test_quadratic_elements_of_regular_cells_move_right_whatever_their_pressures
     boxes = [bar_mesh((n,) * 3, (1.0, 1.0, 1.0), "kuhn") for n in (2, 4)]
     coarse, fine = (errors(box, "quadratic") for box in boxes)
     assert fine.displacement < 0.25 * coarse.displacement and fine.displacement < 0.03
+    assert fine.pressure > 0.5 * coarse.pressure
+    seen = []
+    for box in boxes:
+        rest, cells = cells_of(box, "quadratic")
+        seen.append(inf_sup(cells, on_surface(rest)))
+    assert seen[1] < 0.7 * seen[0]
