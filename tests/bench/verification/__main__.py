@@ -77,7 +77,7 @@ def main(
         print(f"{case.__name__}: {time.perf_counter() - began:.1f} s", flush=True)
     began = time.perf_counter()
     sags = locking.ratios(quick)
-    rows += locking.rows(sags)
+    rows += locking.rows(sags, quick)
     print(f"locking: {time.perf_counter() - began:.1f} s", flush=True)
     failed = [row.case for row in rows if not row.holds]
     report.say(ABOUT)
