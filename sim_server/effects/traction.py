@@ -6,7 +6,7 @@ The part are the triangles of the surface all of whose nodes are in `where`. On 
     force     its total F [N], spread evenly over the area at rest
     stress    force by area at rest [Pa]
     pressure  p [Pa] by area as it is now, against the outward normal: a positive one pushes inward
-    moment    M [N m], by a pressure that is linear over the part at rest and has no resultant
+    moment    M [N m], by a pressure that is linear over the part at rest and has no resultant there
 
 `force` and `stress` keep size and direction (dead loads). `pressure` and `moment` follow the surface: on a triangle
 with the area vector A (outward normal times area, now) node a gets
@@ -18,8 +18,10 @@ C is the centroid of the part at rest, in the pose in which the object begins, a
 
     J c = M x N,    J the second moments of area about C, N the outward normal
 
-so that the moment at the start is M exactly, and later turns with the part. The part has to be flat for `moment`, and M
-to lie in its plane: a pressure makes no torsion. The force of a pressure on a closed surface is zero.
+so that the moment at the start is M exactly, and later turns with the part. Where the part is strained unevenly its
+areas change, and the pressure gets a resultant, of the order of that strain; slender bodies feel it over their length.
+The part has to be flat for `moment`, and M to lie in its plane: a pressure makes no torsion. The force of a pressure on
+a closed surface is zero.
 
 Vectors are those of the scene, after the pose. Forces at fixed nodes go into what holds them.
 

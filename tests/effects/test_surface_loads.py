@@ -110,7 +110,7 @@ def test_the_work_of_a_pressure_is_that_of_the_volume():
     assert records["work"][-1] == pytest.approx(2e4 * (2 - volume), rel=0.02)
 
 
-def stiffness_of_an_arc(layers: int, angle: float) -> float:
+def stiffness_of_an_arc(layers: int, angle: float, elements: str = "linear") -> float:
     """M L / (E I) over the angle by which an end moment turns the end of a slender bar; nodes keep y (nu = 0)."""
     size = (1.0, 0.1 / layers, 0.1)
     bending = 1e5 * size[1] * size[2] ** 3 / 12
@@ -119,7 +119,7 @@ def stiffness_of_an_arc(layers: int, angle: float) -> float:
     steps, moment = 8, bending * angle
     sim = loaded(
         {"where": "X > 0.999", "moment": [0, moment / steps, 0]}, {"scheme": "quasi_static"}, fixed,
-        cells=(10 * layers, 1, layers), size=size, poisson=0.0, tangent="exact",
+        cells=(10 * layers, 1, layers), size=size, poisson=0.0, tangent="exact", elements=elements,
         solver={"preconditioner": "cholesky", "update": "lockstep-1"},
     )  # fmt: skip
     driver = Driver(sim)
@@ -144,6 +144,11 @@ def test_a_bar_bends_to_an_arc_of_curvature_moment_over_stiffness():
     coarse, fine = stiffness_of_an_arc(4, np.pi / 2), stiffness_of_an_arc(8, np.pi / 2)
     assert 1 < fine < coarse < 1.3
     assert (4 * fine - coarse) / 3 == pytest.approx(1, rel=0.01)
+
+
+@pytest.mark.parametrize(("elements", "layers", "error"), [("smoothed", 4, 0.03), ("quadratic", 1, 0.02)])
+def test_few_elements_that_do_not_lock_bend_to_the_same_arc(elements, layers, error):
+    assert stiffness_of_an_arc(layers, np.pi / 2, elements) == pytest.approx(1, rel=error)
 
 
 @pytest.mark.parametrize(

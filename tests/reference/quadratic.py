@@ -16,7 +16,7 @@ def stiffness(cells: StrainCells, nodes: int, young: float, poisson: float) -> s
     mu, lam = young / (2 * (1 + poisson)), young * poisson / ((1 + poisson) * (1 - 2 * poisson))
     own = min(lam, mu)
     m = len(cells.volume)
-    strain = _strains(cells, nodes)
+    strain = strains(cells, nodes)
     dilatation = sp.kron(sp.eye_array(m), np.array([[1.0, 1, 1, 0, 0, 0]])).tocsr() @ strain
     theta = sp.csr_array((cells.volume, (cells.patch, np.arange(m)))) @ dilatation
     matrix = 2 * mu * strain.T @ sp.diags_array(np.repeat(cells.volume, 6)) @ strain
@@ -25,7 +25,7 @@ def stiffness(cells: StrainCells, nodes: int, young: float, poisson: float) -> s
     return sp.csc_array(matrix)
 
 
-def _strains(cells: StrainCells, nodes: int) -> sp.csr_array:
+def strains(cells: StrainCells, nodes: int) -> sp.csr_array:
     """Six components of the small strain of each cell from displacements, (6 m, 3 n)."""
     owner = np.repeat(np.arange(len(cells.volume)), np.diff(cells.start))
     rows, columns, values = [], [], []

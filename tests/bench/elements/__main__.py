@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from sim_server.scene.elements import Kind
 from sim_server.simulation import Simulation
 from sim_server.updates.driver import Driver
+from tests.bench.elements import factors
 from tests.bench.harness.report import Report, plots
 from tests.bench.harness.schemes import SCENES
 
@@ -215,6 +216,11 @@ def main(
     for device in devices:
         picture = diagram([run for run in runs if run.device == device])
         report.figure(picture, f"elements_{device}.png", f"Error of the motion against the time of a step, {device}.")
+    report.say("## Iterations with older factors", factors.HOW)
+    boxes = {kind: _box(tets) for kind, tets in factors.TETS.items()}
+    aged = factors.table(boxes, (0.45,) if quick else (0.3, 0.45, 0.499), 20 if quick else 150)
+    report.table(aged)
+    report.data["older factors"] = aged
     report.say("## All runs")
     report.table([run.table() for run in runs])
     report.data["runs"] = [vars(run) for run in runs]

@@ -61,8 +61,9 @@ MODELS_ABOUT = """\
 A bar of 1 x 1 x 4 m (192 tetrahedra, constants of about E = 1 MPa and Poisson's ratio 0.45, the rest as above) of each
 model, in situations that are hard for one or the other (tests/hard_cases/models.py; some of them are tests). *Newton*:
 with `[integrator] linearizations = 20`, which makes several linearizations a step with a line search; all others make
-one, the default. *clamp*: with `[solver] projection = "clamp"`, what fails so and holds by default. What is known not
-to hold is stated as such and shown: **no**, what does not hold, and why.
+one, the default. *clamp*: with `[solver] projection = "clamp"`, what fails so and holds by default. *patch*, *smoothed*
+and *quadratic* are kinds of `elements`. What is known not to hold is stated as such and shown: **no**, what does not
+hold, and why.
 """
 
 SEEDS_ABOUT = """\

@@ -106,13 +106,13 @@ def ratios(quick: bool) -> list[dict[str, Any]]:
     return found
 
 
-def rows(lines: list[dict[str, Any]]) -> list[Row]:
-    """Those of the largest Poisson's ratio, and of 0.3."""
-    found = []
+def rows(lines: list[dict[str, Any]], quick: bool) -> list[Row]:
+    """Those of the largest Poisson's ratio, and of 0.3. quick: of coarse meshes, which may be off by more."""
+    found, times = [], 1.5 if quick else 1.0
     for line in lines:
         for poisson in (0.3, 0.4999):
             case = f"sag of a cantilever, ν = {poisson:g}, {line['mesh']}, {line['elements']} elements (locking)"
-            found.append(relative(case, 1, line[f"ν = {poisson:g}"], MOST[line["elements"]], SOURCE))
+            found.append(relative(case, 1, line[f"ν = {poisson:g}"], times * MOST[line["elements"]], SOURCE))
     return found
 
 
