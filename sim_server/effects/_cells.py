@@ -44,6 +44,7 @@ from sim_server.scene.regions import region_numbers
 
 Constants = tuple[Float64, Float64]
 TEXT, PATCHES, SUMS = (f"effects/corotational_{name}.cu" for name in ("cells", "patches", "cell_sums"))
+BLOCKS = "kernels/patch_blocks.cu"
 
 
 @dataclass(frozen=True)
