@@ -65,6 +65,7 @@ def work(
     exit_with_parent: Annotated[
         bool, typer.Option("--exit-with-parent", help="End when the parent process ends")
     ] = False,
+    parent: Annotated[int | None, typer.Option("--parent", hidden=True, help="Its process id")] = None,
     verbose: Annotated[bool, typer.Option("--verbose", help="Say more on standard error")] = False,
     version: Annotated[bool, PROGRAM.version_option()] = False,
 ) -> None:
@@ -80,7 +81,7 @@ def work(
         if exit_with_parent:
             from protocol.process.die_with_parent import die_with_parent
 
-            die_with_parent()
+            die_with_parent(parent)
         library = chosen_library(device, precision)
         servers = ["sim"] if server is None else server
         _serve(connect or [], threads, name or _default_name(), servers, not no_shared_memory, library)

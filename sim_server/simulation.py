@@ -173,7 +173,9 @@ class Simulation:
             accumulate = accumulate or stencil is not None
         if self.shape is not None:
             assemble.append(self.shape.launch(system.mean))
-        if not self.world.explicit:
+        if self.world.explicit:
+            assemble += system.keep_directions(frames=False)
+        else:
             assemble += system.finish(matrix)  # into the material frame (eq. 12 and 13)
         settled = self.holders.last_launches(system) if self.holders and not self.integrator.has_stages else []
         return assemble, [*settled, *self.integrator.advance()]
@@ -224,7 +226,8 @@ class Simulation:
         if any(part is None for part in parts):  # then all that `launches` has but for the blocks
             full = self.launches(matrix=False, detect=False)[0][len(self._held_launches) :]
             full = [x for x in full if x.domain != "blocks"]
-            return full if frames else full[:-1] + self.integrator.rotate_force()
+            last = len(self.system.finish(matrix=False))
+            return full if frames else full[:-last] + self.integrator.rotate_force()
         shape = [self.shape.launch(self.system.mean)] if frames and self.shape is not None else []
         finish = self.system.finish(matrix=False) if frames else self.integrator.rotate_force()
         return [self.integrator.start_forces(), *(x for part in parts for x in part or ()), *shape, *finish]

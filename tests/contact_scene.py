@@ -10,7 +10,7 @@ DT = 0.01
 
 CUBE: dict[str, Any] = {
     "name": "cube",
-    "mesh": {"bar": [3, 3, 3], "size": [0.3, 0.3, 0.3]},
+    "mesh": {"bar": [3, 3, 3], "size": [0.3, 0.3, 0.3], "split": "kuhn"},
     "pose": {"translate": [0, 0.02, 0]},
     "effects": {"corotational": {"young": 1e5, "poisson": 0.3}, "touch": True},
 }

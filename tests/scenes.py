@@ -32,7 +32,7 @@ def bar(cells: tuple[int, int, int] = (4, 2, 2), size: tuple[float, float, float
     if touch := table.pop("touch", None):
         effects["touch"] = touch
     del table["young"]
-    table.setdefault("mesh", {"bar": list(cells), "size": list(size)})
+    table.setdefault("mesh", {"bar": list(cells), "size": list(size), "split": "kuhn"})
     return {"effects": effects, **table}
 
 
@@ -61,7 +61,7 @@ def mesh_file(folder: Path, rest: NDArray, tets: NDArray, name: str = "mesh") ->
 
 def jittered_bar(cells: tuple[int, int, int], size: tuple[float, float, float], seed: int = 0) -> tuple:
     """(rest, tets) of a bar whose nodes inside are moved at random, so that no two elements are alike."""
-    mesh = bar_mesh(cells, size)
+    mesh = bar_mesh(cells, size, "kuhn")
     rest, cell = mesh.rest.copy(), np.array(size) / cells
     inside = interior(rest, size)
     random = np.random.default_rng(seed)

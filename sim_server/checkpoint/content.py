@@ -22,6 +22,7 @@ from protocol.factor import Factor, FactorPattern
 from protocol.refused import Refused
 from sim_server.checkpoint.file import Checkpoint
 from sim_server.errors import InputError
+from sim_server.scene import Scene, earlier_defaults
 from sim_server.simulation import Simulation
 from sim_server.state.arrays import state_arrays
 from sim_server.updates.driver import Driver
@@ -104,9 +105,9 @@ class SavedFactors:
     jobs: list[Job]
 
 
-def digest(simulation: Simulation) -> str:
+def digest(resolved: dict[str, Any]) -> str:
     """Returns a digest of the scene with all defaults and overrides, but for what a log is to hold."""
-    table = {k: v for k, v in simulation.scene.resolved().items() if k != "record"}
+    table = {k: v for k, v in resolved.items() if k != "record"}
     return hashlib.sha256(json.dumps(table, sort_keys=True).encode()).hexdigest()
 
 
@@ -138,7 +139,7 @@ def capture(simulation: Simulation, driver: Driver, software: str) -> Checkpoint
         bodies.append(entry)
     manifest = Manifest(
         format="", version=0, software=software, device=simulation.world.backend.name,
-        build=simulation.world.backend.build(), scene=simulation.scene.name, digest=digest(simulation),
+        build=simulation.world.backend.build(), scene=simulation.scene.name, digest=digest(simulation.scene.resolved()),
         resolved=simulation.scene.resolved(), step=engine.step, start_time=engine.loop.start_time, bodies=bodies,
         interactions=[_touch_entry(a) for a in interactions], last_interaction=touch.last_id if touch else 0,
         parameters=simulation.parameters.changed,
@@ -164,8 +165,10 @@ def restore(simulation: Simulation, checkpoint: Checkpoint) -> Manifest:
     manifest, engine, touch = manifest_of(checkpoint), simulation.engine, simulation.touch
     if manifest.device != simulation.world.backend.name:
         raise InputError(f"made on a {manifest.device}, this is a {simulation.world.backend.name}: --device")
-    if manifest.digest != digest(simulation):
-        raise InputError(f"of another scene ({_differences(manifest.resolved, simulation.scene.resolved())})")
+    if manifest.digest != digest(now := simulation.scene.resolved()):
+        saved = _as_of_this_version(manifest.resolved)
+        if digest(saved) != digest(now):
+            raise InputError(f"of another scene ({_differences(saved, now)})")
     arrays = state_arrays(simulation)
     values = [checkpoint.array(f"state/{a.name}", now.dtype, now.shape) for a in arrays for now in [a.read()]]
     known = {f"state/{a.name}" for a in arrays}
@@ -254,6 +257,14 @@ def _interaction(simulation: Simulation, checkpoint: Checkpoint, entry: TouchEnt
             f"manifest.json: an interaction with object {entry.object[:80]!r}, which the scene does not have"
         )
     return Interaction(nodes=nodes, offset=offset, **entry.model_dump())
+
+
+def _as_of_this_version(resolved: dict[str, Any]) -> dict[str, Any]:
+    """Returns a resolved scene of any version with the keys of this one; as it is where this one cannot read it."""
+    try:
+        return Scene.model_validate(earlier_defaults.named(resolved), context={"files": "known"}).resolved()
+    except ValidationError:
+        return resolved
 
 
 def _differences(saved: Any, now: Any, at: str = "") -> str:

@@ -67,7 +67,7 @@ class Effect:
 
     @property
     def element_nodes(self) -> list[Int32]:
-        """One node of each item of its launches over elements, cells and patches, in their order."""
+        """One node of each item of its launches over elements, triangles, cells and patches, in their order."""
         return [] if self.elements is None else [self.elements[:, 0]]
 
     @property
@@ -120,6 +120,7 @@ class Effect:
         """Returns arrays that the energy balance of a step reads, by their names in backends.energies; {} for most.
 
         gravity: acceleration (3,) [m/s2]. force (n, 3) [N], spring (n,) [N/m], anchor (n, 3) [m]: of pushes and grabs.
+        load (n, 3): of surfaces [N].
         """
         return {}
 

@@ -4,18 +4,27 @@
 A cell c has one deformation gradient F = sum_a x_a (x) G_a over its nodes, R the rotation nearest to F = R S, volume V;
 a patch p of cells one mean dilatation (mesh/strain_cells.py). The energy is ::
 
-    W = sum_c V mu |dev(S - I)|^2 + sum_p kappa / 2 V_p theta_p^2,   theta_p = sum_c V tr(S - I) / V_p
+    W = sum_c V (mu |S - I|^2 + lambda_c / 2 tr(S - I)^2) + sum_p kappa / 2 V_p theta_p^2
 
-with kappa = lambda + 2/3 mu, in a patch with several constants their mean by volume. Forces are its slope ::
+    theta_p = sum_c V tr(S - I) / V_p
 
-    f_a = -sum_c V R (2 mu dev(S - I) + kappa theta_p I) G_a
+with kappa = lambda - lambda_c, in a patch with several constants their mean by volume. With lambda_c = -2/3 mu cells
+have energy of their deviators alone: so in patches of tetrahedra. Points of quadratic elements keep lambda_c =
+min(lambda, mu): without, an element resists none of the three quadratic motions whose strain is a multiple of I that
+is 0 on average, and meshes of few elements across are too soft; with it they lock no more. Forces are its slope ::
 
-and the usual tangent, with R held, is that of the deviators and one matrix of rank one for each patch ::
+    f_a = -sum_c V R (2 mu (S - I) + (lambda_c tr(S - I) + kappa theta_p) I) G_a
 
-    K_ab = sum_c V mu (g_b g_a^T + (g_a . g_b) I - 2/3 g_a g_b^T) + sum_p kappa V_p g_p,a g_p,b^T,   g_a = R G_a
+and the usual tangent, with R held, is that of the cells and one matrix of rank one for each patch, g_a = R G_a ::
+
+    K_ab = sum_c V (mu (g_b g_a^T + (g_a . g_b) I) + lambda_c g_a g_b^T) + sum_p kappa V_p g_p,a g_p,b^T
 
 with g_p,a = sum_c V R G_a / V_p, positive semi-definite as it is. The exact one adds the twists of each cell, as in
-corotational.py with the pressure p = kappa theta_p - 2/3 mu tr(S - I) in the place of lambda tr(S - I).
+corotational.py with the pressure p = kappa theta_p + lambda_c tr(S - I) in the place of lambda tr(S - I).
+
+Of `smoothed` elements cells around edges have the deviators, and theta_p is of one cell that is the whole patch
+(mesh/cell_builders.py). The twists of each are kept from being negative by themselves, so that the exact tangent is a
+little stiffer than the forces.
 
 Source: Bonet and Burton, A simple average nodal pressure tetrahedral element, 1998; de Souza Neto, Andrade Pires and
 Owen, F-bar-based linear triangles and tetrahedra (patches), 2005.
@@ -38,7 +47,7 @@ from sim_server.mechanics.system import Stencil, System
 from sim_server.mechanics.world import Body, World
 from sim_server.mesh.cell_builders import edge_cells, tetrahedron_cells
 from sim_server.mesh.quadratic_cells import quadratic_cells
-from sim_server.mesh.strain_cells import StrainCells, joined
+from sim_server.mesh.strain_cells import DEVIATOR, DILATATION, StrainCells, joined
 from sim_server.scene import Scene
 from sim_server.scene.regions import region_numbers
 
@@ -75,7 +84,9 @@ class StrainCellElements(Effect):
         self.elastic = world.at_start(self.elastic_in)
         parts = [cells_of(body, params) for body, params in listed]
         self.cells = joined(parts, [(body.first, len(body.tets)) for body in self.rotated])
-        self.owner = _owner(self.rotated, [len(part.volume) for part in parts])
+        counts = [len(part.volume) for part in parts]
+        self.owner = _owner(self.rotated, counts)
+        self._keeps_lambda = np.repeat([body.elements == "quadratic" for body in self.rotated], counts)
         self._patch_owner = _owner(self.rotated, [part.patches for part in parts])
         self._lay_out()
         self._follow()
@@ -93,32 +104,39 @@ class StrainCellElements(Effect):
         """Makes slices, patches and the lists of both."""
         cells = self.cells
         self.slices = sliced(cells.start, cells.nodes, cells.gradients)
-        clusters = self.slices.clusters
+        strained, dilating = cells.has(DEVIATOR), cells.has(DILATATION)
+        clusters = self.slices.clusters.taken(dilating)
         patches, start, corners = united(clusters, cells.patch, cells.patches)
-        self._coupled = PatchedCells(clusters, patches)
+        alone = self.slices.clusters.taken(dilating & ~strained)
+        self._coupled = PatchedCells(self.slices.clusters.taken(strained), patches, alone)
         self._corners = Lists(start, clusters.owner[corners], clusters.slots[corners])
-        order = np.argsort(cells.patch, kind="stable").astype(np.int32)
+        members = np.flatnonzero(dilating)
+        order = members[np.argsort(cells.patch[members], kind="stable")].astype(np.int32)
         begin = np.searchsorted(cells.patch[order], np.arange(cells.patches + 1)).astype(np.int32)
         self._members = Lists(begin, order, np.zeros(0, np.int32))
-        self.patch_volume = np.bincount(cells.patch, cells.volume, cells.patches)
+        self.volume = cells.volume * dilating
+        self.patch_volume = np.bincount(cells.patch, self.volume, cells.patches)
         self.inverse_volume = 1 / self.patch_volume
 
     def _follow(self) -> None:
         """Makes the arrays that follow the material constants."""
         cells, volume = self.cells, self.cells.volume
+        strained = cells.has(DEVIATOR)
 
-        def constants(scene: Scene) -> Constants:
-            """mu of the cells and kappa of the patches [Pa]."""
+        def constants(scene: Scene) -> tuple[Float64, Float64, Float64]:
+            """mu of the cells, kappa of the patches and lambda_c of the cells [Pa]."""
             young, poisson = np.concatenate([*self.elastic_in(scene).values()], axis=1)[:, cells.element]
-            kappa = np.bincount(cells.patch, volume * young / (3 * (1 - 2 * poisson)), cells.patches)
-            return young / (2 * (1 + poisson)), kappa / self.patch_volume
+            mu, whole = young / (2 * (1 + poisson)), young * poisson / ((1 + poisson) * (1 - 2 * poisson))
+            own = np.where(self._keeps_lambda, np.minimum(whole, mu), -2 / 3 * mu)
+            kappa = np.bincount(cells.patch, self.volume * (whole - own), cells.patches)
+            return mu, kappa / self.patch_volume, own
 
         def moduli(scene: Scene) -> Float64:
-            mu, kappa = constants(scene)
-            return np.stack([mu * volume, kappa[cells.patch] * volume])
+            mu, kappa, own = constants(scene)
+            return np.stack([mu * strained, kappa[cells.patch] * cells.has(DILATATION), own * strained, mu]) * volume
 
         def share(scene: Scene) -> Float64:
-            mu, kappa = constants(scene)
+            mu, kappa, _ = constants(scene)
             return np.sqrt(kappa[cells.patch] * volume / (mu * self.patch_volume[cells.patch]))
 
         follow = self.world.follow
@@ -131,7 +149,7 @@ class StrainCellElements(Effect):
 
     @property
     def element_nodes(self) -> list[Int32]:
-        cells, patches = self._coupled.cells, self._coupled.patches
+        cells, patches = self.slices.clusters, self._coupled.patches
         return [cells.nodes[cells.start[:-1]], patches.nodes[patches.start[:-1]], patches.nodes]
 
     def rows_of_bodies(self, array: NDArray[Any]) -> Callable[[int], Any] | None:
@@ -173,7 +191,27 @@ class StrainCellElements(Effect):
             "blocks", len(system.sums), start=patches.pair_start, pairs=patches.pairs,
             patch_gradients=self.patch_gradients, sums=system.sums,
         )  # fmt: skip
-        return [*self._measured("measure", self.quaternion), elements, gradients, gather, own, blocks, of_patches]
+        forces = [*self._measured("measure", self.quaternion), elements, gradients, gather]
+        return [*forces, own, blocks, of_patches, *self._of_dilating(system, stencil.dilating, exact)]
+
+    def _of_dilating(self, system: System, stencil: Stencil | None, exact: bool) -> list[Launch]:
+        """Returns the gathers of cells that have a dilatation alone."""
+        if stencil is None:
+            return []
+        w, lists = self.world, {"start": stencil.corner_start, "corners": stencil.corners}
+        if not exact:
+            module = w.backend.module("effects/corotational_nodes.cu")
+            return [module.bind("gather_impulses", w.nodes, nodal_impulse=self.nodal_impulse, b=system.b, **lists)]
+        sums, twist = w.backend.module(SUMS), {"twist": self.twist, "scaled_gradients": self.scaled_gradients}
+        gather = sums.bind(
+            "gather_twists", w.nodes, owners=stencil.corner_owners, nodal_impulse=self.nodal_impulse, b=system.b,
+            block=system.block, **lists, **twist,
+        )  # fmt: skip
+        blocks = sums.bind(
+            "twist_blocks", len(system.sums), start=stencil.pair_start, pairs=stencil.pairs,
+            owners=stencil.pair_owners, sums=system.sums, **twist,
+        )  # fmt: skip
+        return [gather, blocks]
 
     def force_launches(self, system: System, stencil: Stencil | None, frames: bool) -> list[Launch] | None:
         assert stencil is not None
@@ -192,13 +230,14 @@ class StrainCellElements(Effect):
             gather = w.backend.module("effects/corotational_nodes.cu").bind(
                 "gather_impulses", w.nodes, b=system.b, **lists
             )  # fmt: skip
-        return [*self._measured("measure_near", self.near), impulses, gather]
+        others = self._of_dilating(system, stencil.dilating, exact=False)
+        return [*self._measured("measure_near", self.near), impulses, gather, *others]
 
     def _measured(self, kernel: str, quaternion: Float64) -> list[Launch]:
         """Returns the launches up to the mean dilatations."""
         w = self.world
         measure = w.backend.module(TEXT).bind(
-            kernel, len(self.owner), nodes=self.slices.nodes, x=w.x, v=w.damping_velocity, volume=self.cells.volume,
+            kernel, len(self.owner), nodes=self.slices.nodes, x=w.x, v=w.damping_velocity, volume=self.volume,
             quaternion=quaternion, strain=self.strain, dilatation=self.dilatation, **self._of_slices(),
         )  # fmt: skip
         means = w.backend.module(PATCHES).bind(
@@ -222,9 +261,9 @@ class StrainCellElements(Effect):
         }  # fmt: skip
 
     def energies(self) -> ElementEnergies:
-        """V mu |dev(S - I)|^2 of the cells [J]."""
+        """What the cells have by themselves [J]."""
         launch = self.world.backend.module(TEXT).bind(
-            "energy", len(self.owner), nodes=self.slices.nodes, x=self.world.x, volume=self.cells.volume,
+            "energy", len(self.owner), nodes=self.slices.nodes, x=self.world.x, volume=self.volume,
             moduli=self.moduli, dilatation=self._energy_dilatation, energy=self._energy, **self._of_slices(),
         )  # fmt: skip
         return ElementEnergies(launch, self._energy, self.owner)

@@ -231,7 +231,9 @@ def _mask(world: World, holder: Holder) -> NDArray[np.bool_]:
     fixed = body.effects.get("fixed")
     others = world.held > 0
     if fixed is not None:
-        others[body.nodes] |= where.mask(fixed.where, body.mesh.rest)
+        from sim_server.effects.fixed import clamped_nodes  # what a scene does not list is not imported
+
+        others[body.nodes] |= clamped_nodes(fixed, body.mesh.rest)
     if (held & others).any():
         raise InputError(
             f"holder {holder.name!r}: {int((held & others).sum())} of its nodes are fixed, or another holder's: a node "

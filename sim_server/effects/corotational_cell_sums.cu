@@ -9,7 +9,7 @@ struct CellNodes {
     const int* corners;             // (start[n],) slots of the cells at the node
     const int* owners;              // (start[n],) the cells
     const local* nodal_impulse;     // (slots, 3) [N s]
-    const local* scaled_gradients;  // (slots, 4) g_a, -2/3
+    const local* scaled_gradients;  // (slots, 4) g_a, lambda_c / mu
     const local* quaternion;        // (cells, 4) unit quaternions
     own<real> b;                    // (n, 3) in, out: right-hand side, world frame [N s]
     own<local> block;               // (n, 6) in, out: upper triangle of the node's own block of A, world frame [kg]
@@ -42,7 +42,7 @@ struct ExactCellNodes {
     const int* corners;             // (start[n],) slots of the cells at the node
     const int* owners;              // (start[n],) the cells
     const local* nodal_impulse;     // (slots, 3) [N s]
-    const local* scaled_gradients;  // (slots, 4) g_a, -2/3
+    const local* scaled_gradients;  // (slots, 4) g_a, lambda_c / mu
     const local* twist;             // (cells, 6) E
     const local* quaternion;        // (cells, 4) unit quaternions
     own<real> b;                    // (n, 3) in, out: right-hand side, world frame [N s]
@@ -91,7 +91,7 @@ struct CellBlocks {
     int accumulate;                 // 0: write, 1: add to what another effect wrote
     const int* start;               // (n + 1,) into pairs
     const int* pairs;               // (start[n], 2) slots of a cell at the block's row and column
-    const local* scaled_gradients;  // (slots, 4) g_a, -2/3
+    const local* scaled_gradients;  // (slots, 4) g_a, lambda_c / mu
     own<local> sums;                // (n, 9) out, world frame, row major [kg]
 };
 
@@ -114,7 +114,7 @@ struct ExactCellBlocks {
     const int* start;               // (n + 1,) into pairs
     const int* pairs;               // (start[n], 2) slots of a cell at the block's row and column
     const int* owners;              // (start[n],) the cells
-    const local* scaled_gradients;  // (slots, 4) g_a, -2/3
+    const local* scaled_gradients;  // (slots, 4) g_a, lambda_c / mu
     const local* twist;             // (cells, 6) E
     own<local> sums;                // (n, 9) out, world frame, row major [kg]
 };
@@ -128,3 +128,55 @@ INLINE void blocks_exact_add(const ExactCellBlocks& p, int, int k, local* s) {
 }
 INLINE void blocks_exact_put(const ExactCellBlocks& p, int i, const local* sum) { put_blocks(p, i, sum); }
 SUM_KERNEL(blocks_exact, ExactCellBlocks, 9)
+
+// Of cells that have a dilatation alone, whose usual tangent is their patch's: the impulses, and the twists of the exact one.
+struct TwistNodes {
+    int n;                          // nodes
+    const int* start;               // (n + 1,) into corners
+    const int* corners;             // (start[n],) slots of the cells at the node
+    const int* owners;              // (start[n],) the cells
+    const local* nodal_impulse;     // (slots, 3) [N s]
+    const local* scaled_gradients;  // (slots, 4) g_a
+    const local* twist;             // (cells, 6) E
+    own<real> b;                    // (n, 3) in, out: right-hand side, world frame [N s]
+    own<local> block;               // (n, 6) in, out: upper triangle of the node's own block of A, world frame [kg]
+};
+
+INLINE void gather_twists_add(const TwistNodes& p, int, int k, local* sum) {
+    const local* f = p.nodal_impulse + 3 * p.corners[k];
+    local g[4], t[9] = {};
+    get_row(p.scaled_gradients, p.corners[k], g);
+    for (int m = 0; m < 3; ++m) sum[m] += f[m];
+    add_twist(t, g, g, p.twist + 6 * p.owners[k]);
+    sum[3] += t[0]; sum[4] += t[1]; sum[5] += t[2]; sum[6] += t[4]; sum[7] += t[5]; sum[8] += t[8];
+}
+
+INLINE void gather_twists_put(const TwistNodes& p, int i, const local* sum) {
+    for (int m = 0; m < 3; ++m) row_put<3>(p.b, i, m, row_at<3>(p.b, i, m) + sum[m]);
+    for (int m = 0; m < 6; ++m) row_put<6>(p.block, i, m, row_at<6>(p.block, i, m) + sum[3 + m]);
+}
+
+SUM_KERNEL(gather_twists, TwistNodes, 9)
+
+struct TwistBlocks {
+    int n;                          // blocks above the diagonal
+    const int* start;               // (n + 1,) into pairs
+    const int* pairs;               // (start[n], 2) slots of a cell at the block's row and column
+    const int* owners;              // (start[n],) the cells
+    const local* scaled_gradients;  // (slots, 4) g_a
+    const local* twist;             // (cells, 6) E
+    own<local> sums;                // (n, 9) in, out, world frame, row major [kg]
+};
+
+INLINE void twist_blocks_add(const TwistBlocks& p, int, int k, local* s) {
+    local a[4], b[4];
+    get_row(p.scaled_gradients, p.pairs[2 * k], a);
+    get_row(p.scaled_gradients, p.pairs[2 * k + 1], b);
+    add_twist(s, a, b, p.twist + 6 * p.owners[k]);
+}
+
+INLINE void twist_blocks_put(const TwistBlocks& p, int i, const local* sum) {
+    for (int m = 0; m < 9; ++m) row_put<9>(p.sums, i, m, row_at<9>(p.sums, i, m) + sum[m]);
+}
+
+SUM_KERNEL(twist_blocks, TwistBlocks, 9)

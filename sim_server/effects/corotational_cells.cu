@@ -14,7 +14,7 @@ struct CorotationalCells {
     const real* x;           // (nodes, 3) positions [m]
     const real* v;           // (nodes, 3) world.damping_velocity [m/s]
     const local* gradients;  // (3, slots) [1/m]
-    const local* volume;     // (n,) V [m3]
+    const local* volume;     // (n,) V [m3], 0 where the cell has a deviator alone
     local* quaternion;       // (n, 4) out: unit quaternion of the nearest rotation of F, w first; of `measure_near` also in
     local* strain;           // (15, n) out: S = R^T F, its upper triangle, and T = R^T dF/dt [1/s], row major
     local* dilatation;       // (n, 2) out: V tr(S - I) [m3], V tr T [m3/s]
@@ -60,7 +60,7 @@ struct CorotationalCellImpulses {
     const local* gradients;              // (3, slots) [1/m]
     const int* patch;                    // (n,) of the cell
     const local* mean_dilatation;        // (patches, 2) theta [-], its rate [1/s]
-    const local* moduli;                 // (2, n) mu V, kappa V [Pa m3]
+    const local* moduli;                 // (4, n) mu V, kappa V, lambda_c V, 0 where the cell has none, and m V [Pa m3]
     const local* stiffness_coefficient;  // (n,) h (c + beta) [s2], c world.dx_dv, beta the Rayleigh damping of the stiffness
     local h;                             // world.force_coefficient: the time step in backward Euler [s]
     const local* quaternion;             // (n, 4) unit quaternions
@@ -80,28 +80,33 @@ template <class P> INLINE local_mat3 cell_rotation(const P& p, index i) {
                                                     at(p.quaternion, 4 * i + 2), at(p.quaternion, 4 * i + 3)});
 }
 
-// Stress times V in the frame of the cell: the deviator's own, and the patch's pressure.
+template <class P> INLINE local_number cell_lambda(const P& p, index i) { return at_items(p.moduli + 2 * (long long)p.n, i); }
+
+// m V, m being mu of the material, which scales gradients.
+template <class P> INLINE local_number cell_modulus(const P& p, index i) { return at_items(p.moduli + 3 * (long long)p.n, i); }
+
+// Stress times V in the frame of the cell: its own, and the patch's pressure.
 template <class P> INLINE local_mat3 cell_stress(const P& p, index i, const local_mat3& S, const local_mat3& T) {
     const local_number k = at_items(p.stiffness_coefficient, i), mu = at_items(p.moduli, i), kappa = at_items(p.moduli + p.n, i);
     const index patch = at(p.patch, i);
     const local_number theta = at(p.mean_dilatation, 2 * patch), rate = at(p.mean_dilatation, 2 * patch + 1);
-    local_mat3 stress = hooke(S, T, p.h, k, (local)(-2.0 / 3) * mu, mu);
+    local_mat3 stress = hooke(S, T, p.h, k, cell_lambda(p, i), mu);
     const local_number pressure = kappa * (p.h * theta + k * rate);
     stress.m[0] += pressure; stress.m[4] += pressure; stress.m[8] += pressure;
     return stress;
 }
 
 template <class P> INLINE local_mat3 cell_twists(const P& p, index i, const local_mat3& S) {
-    const local_number mu = at_items(p.moduli, i), kappa = at_items(p.moduli + p.n, i);
+    const local_number m = 1 / cell_modulus(p, i), mu = m * at_items(p.moduli, i), kappa = m * at_items(p.moduli + p.n, i);
     const local_number theta = at(p.mean_dilatation, 2 * at(p.patch, i));
-    return twists(S, kappa / mu * theta - (local)(2.0 / 3) * (trace(S) - 3) - 2);
+    return twists(S, mu, kappa * theta + m * cell_lambda(p, i) * (trace(S) - 3) - 2 * mu);
 }
 
 KERNEL(impulses, CorotationalCellImpulses) {
     local_mat3 S, T;
     get_strain(p, i, S, T);
     local_mat3 P = cell_stress(p, i, S, T);
-    if (p.exact) add_spin_stress(P, T, cell_twists(p, i, S), at_items(p.stiffness_coefficient, i) * at_items(p.moduli, i));
+    if (p.exact) add_spin_stress(P, T, cell_twists(p, i, S), at_items(p.stiffness_coefficient, i) * cell_modulus(p, i));
     P = mul(cell_rotation(p, i), P);
     put_cell_impulses(cell_slots(p.first, p.width, i), i, p.n, p.gradients, p.slots, P, p.nodal_impulse);
 }
@@ -114,20 +119,20 @@ struct CorotationalCellElements {
     const local* gradients;              // (3, slots) [1/m]
     const int* patch;                    // (n,) of the cell
     const local* mean_dilatation;        // (patches, 2) theta [-], its rate [1/s]
-    const local* moduli;                 // (2, n) mu V, kappa V [Pa m3]
+    const local* moduli;                 // (4, n) mu V, kappa V, lambda_c V, 0 where the cell has none, and m V [Pa m3]
     const local* stiffness_coefficient;  // (n,) h (c + beta) [s2]
     local h;                             // world.force_coefficient [s]
     const local* quaternion;             // (n, 4) unit quaternions
     const local* strain;                 // (15, n) S and T
-    local* scaled_gradients;             // (slots, 4) out: g_a = sqrt(h (c + beta) mu V) R G_a, and -2/3, lambda / mu of the deviator
+    local* scaled_gradients;             // (slots, 4) out: g_a = sqrt(h (c + beta) m V) R G_a, and lambda_c / m
     local* nodal_impulse;                // (slots, 3) out: h f_a + h (c + beta) (K v)_a [N s]
 };
 
 template <class P> INLINE void put_cell_results(const P& p, index i, const local_mat3& stress, const local_mat3& R) {
     const slots s = cell_slots(p.first, p.width, i);
     put_cell_impulses(s, i, p.n, p.gradients, p.slots, mul(R, stress), p.nodal_impulse);
-    const local_number w = sqrt(at_items(p.stiffness_coefficient, i) * at_items(p.moduli, i));
-    put_cell_gradients(s, i, p.n, p.gradients, p.slots, R, w, local_number{} - (local)(2.0 / 3), p.scaled_gradients);
+    const local_number m = cell_modulus(p, i), w = sqrt(at_items(p.stiffness_coefficient, i) * m);
+    put_cell_gradients(s, i, p.n, p.gradients, p.slots, R, w, cell_lambda(p, i) / m, p.scaled_gradients);
 }
 
 KERNEL(elements, CorotationalCellElements) {
@@ -144,7 +149,7 @@ struct CorotationalExactCellElements {
     const local* gradients;              // (3, slots) [1/m]
     const int* patch;                    // (n,) of the cell
     const local* mean_dilatation;        // (patches, 2) theta [-], its rate [1/s]
-    const local* moduli;                 // (2, n) mu V, kappa V [Pa m3]
+    const local* moduli;                 // (4, n) mu V, kappa V, lambda_c V, 0 where the cell has none, and m V [Pa m3]
     const local* stiffness_coefficient;  // (n,) h (c + beta) [s2]
     local h;                             // world.force_coefficient [s]
     const local* quaternion;             // (n, 4) unit quaternions
@@ -158,7 +163,7 @@ KERNEL(exact_elements, CorotationalExactCellElements) {
     local_mat3 S, T;
     get_strain(p, i, S, T);
     local_mat3 P = cell_stress(p, i, S, T), E = cell_twists(p, i, S), R = cell_rotation(p, i);
-    add_spin_stress(P, T, E, at_items(p.stiffness_coefficient, i) * at_items(p.moduli, i));
+    add_spin_stress(P, T, E, at_items(p.stiffness_coefficient, i) * cell_modulus(p, i));
     put_cell_results(p, i, P, R);
     E = mul(R, mul(E, transposed(R)));
     const local_number row[6] = {E.m[0], E.m[1], E.m[2], E.m[4], E.m[5], E.m[8]};
@@ -173,10 +178,10 @@ struct CorotationalCellEnergy {
     const int* nodes;        // (slots,)
     const real* x;           // (nodes, 3) [m]
     const local* gradients;  // (3, slots) [1/m]
-    const local* volume;     // (n,) V [m3]
-    const local* moduli;     // (2, n) mu V, kappa V [Pa m3]
+    const local* volume;     // (n,) V [m3], 0 where the cell has a deviator alone
+    const local* moduli;     // (4, n) mu V, kappa V, lambda_c V, 0 where the cell has none, and m V [Pa m3]
     local* dilatation;       // (n,) out: V tr(S - I) [m3]
-    local* energy;           // (n,) out: V mu |dev(S - I)|^2, S = R^T F [J]
+    local* energy;           // (n,) out: V (mu |dev(S - I)|^2 + (lambda_c / 2 + mu / 3) tr(S - I)^2), S = R^T F [J]
 };
 
 KERNEL(energy, CorotationalCellEnergy) {
@@ -188,6 +193,7 @@ KERNEL(energy, CorotationalCellEnergy) {
         local_number e = k % 4 == 0 ? S.m[k] - mean : S.m[k];
         square += e * e;
     }
-    put(p.energy, i, at_items(p.moduli, i) * square);
+    const local_number mu = at_items(p.moduli, i), bulk = (local)0.5 * cell_lambda(p, i) + (local)(1.0 / 3) * mu;
+    put(p.energy, i, mu * square + bulk * trace3 * trace3);
     put(p.dilatation, i, at_items(p.volume, i) * trace3);
 }

@@ -19,8 +19,8 @@ struct CorotationalExactElements {
     local* nodal_impulse;                // (n, 4, 3) out: h f_a + h (c + beta) (K v)_a [N s]
 };
 
-INLINE local_mat3 twists(const local_mat3& S, local_number lambda, local_number mu) {
-    return twists(S, lambda / mu * (trace(S) - 3) - 2);
+INLINE local_mat3 hooke_twists(const local_mat3& S, local_number lambda, local_number mu) {
+    return twists(S, local_number{} + 1, lambda / mu * (trace(S) - 3) - 2);
 }
 
 // The stress of `hooke` and what E adds to it, which is of the spin of T.
@@ -41,7 +41,7 @@ KERNEL(elements, CorotationalExactElements) {
     local_mat3 S = mul(Rt, F), T = mul(Rt, G);
 
     local_number k = at_items(p.stiffness_coefficient, i), lambda = at_items(p.lame, i), mu = at_items(p.lame + p.n, i);
-    local_mat3 E = twists(S, lambda, mu), P = exact_stress(S, T, E, p.h, k, lambda, mu);
+    local_mat3 E = hooke_twists(S, lambda, mu), P = exact_stress(S, T, E, p.h, k, lambda, mu);
     put_impulses(p.nodal_impulse, i, p.n, mul(R, P), g);
     put_scaled_gradients(p.scaled_gradients, i, p.n, R, g, sqrt(k * mu), lambda / mu);
     E = mul(R, mul(E, Rt));
@@ -72,7 +72,7 @@ KERNEL(forces, CorotationalExactForces) {
     quaternion<local_number> q = nearest_quaternion(F, {near[0], near[1], near[2], near[3]});
     local_mat3 R = rotation_matrix(q), Rt = transposed(R), S = mul(Rt, F), T = mul(Rt, gradient(p.v, tet, g));
     local_number k = at_items(p.stiffness_coefficient, i), lambda = at_items(p.lame, i), mu = at_items(p.lame + p.n, i);
-    local_mat3 P = exact_stress(S, T, twists(S, lambda, mu), p.h, k, lambda, mu);
+    local_mat3 P = exact_stress(S, T, hooke_twists(S, lambda, mu), p.h, k, lambda, mu);
     put_impulses(p.nodal_impulse, i, p.n, mul(R, P), g);
     put_row(p.quaternion, i, p.n, {q.w, q.x, q.y, q.z});
 }

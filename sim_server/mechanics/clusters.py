@@ -5,6 +5,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sim_server.arrays import Float64, Int32, Int64
 from sim_server.mechanics.world import World
@@ -20,24 +21,36 @@ class Clusters:
 
     start: (m + 1,), where the nodes of each begin; nodes: (start[m],), of the scene
     slots: (start[m],), places that kernels have the results of each node at
+    number: (m,), the cell or patch that each is; None: 0, 1, 2, ...
     """
 
     start: Int32
     nodes: Int32
     slots: Int32
+    number: Int32 | None = None
 
     @property
     def owner(self) -> Int32:
-        """Cluster of each of the nodes, (start[m],)."""
-        return np.repeat(np.arange(len(self.start) - 1, dtype=np.int32), np.diff(self.start))
+        """Number of the cluster of each of the nodes, (start[m],)."""
+        number = np.arange(len(self.start) - 1, dtype=np.int32) if self.number is None else self.number
+        return np.repeat(number, np.diff(self.start))
+
+    def taken(self, mask: NDArray[np.bool_]) -> "Clusters":
+        """Returns some of them, with the numbers that they have here. mask: (m,)"""
+        sizes = np.diff(self.start)
+        kept = np.repeat(mask, sizes)
+        start = np.concatenate([[0], np.cumsum(sizes[mask])]).astype(np.int32)
+        return Clusters(start, self.nodes[kept], self.slots[kept], np.flatnonzero(mask).astype(np.int32))
 
 
 @dataclass(frozen=True)
 class PatchedCells:
-    """Clusters of an effect: strain cells, and patches of them, which couple whatever their cells do."""
+    """Clusters of an effect: strain cells with a deviator, patches, and cells that have a dilatation alone; patches
+    couple whatever these do."""
 
     cells: Clusters
     patches: Clusters
+    dilating: Clusters
 
 
 def couplings(clusters: Clusters, world: World) -> Couplings:

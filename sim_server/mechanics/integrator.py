@@ -257,7 +257,7 @@ class Integrator:
 
 
 def rows_of(effects: Sequence[CouplesNodes]) -> list[Int32]:
-    """Returns one node of each element, cell or patch, per effect that has some."""
+    """Returns one node of each element, triangle, cell or patch, per effect that has some."""
     return [nodes for e in effects for nodes in e.element_nodes]
 
 

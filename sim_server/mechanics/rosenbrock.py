@@ -87,7 +87,8 @@ class RosenbrockIntegrator(Integrator):
         self.share, self.weight = w.follow("rayleigh", compute=share), w.follow("rayleigh", compute=weight)
         self.first, self.estimate, self.known = np.zeros_like(w.v), np.zeros(w.nodes), np.zeros((w.nodes, 6))
         self.bound = np.array([self._bound(b) for b in w.bodies])
-        self.unheld = np.array([(w.free[b.nodes] > 0).all() for b in w.bodies], np.int32)
+        limited = np.zeros(w.nodes, np.int32) if w.rollers is None else w.rollers.limited
+        self.unheld = np.array([(w.free[b.nodes] > limited[b.nodes]).all() for b in w.bodies], np.int32)
         self.factor_alone = scene.uses_factor_alone
         w.backend.keep(self.share, self.weight, self.first, self.estimate, self.known)
 
@@ -124,9 +125,10 @@ class RosenbrockIntegrator(Integrator):
     def rotate_force(self) -> list[Launch]:
         """Takes b of the second stage into the material frame."""
         s, free = self.system, self.world.free
-        return [
-            self._stage("rotate_force", free=free, rotation=s.rotation, b=s.b, dv=s.dv, b_material=s.b_material, y=s.y)
-        ]
+        rotate = self._stage(
+            "rotate_force", free=free, rotation=s.rotation, b=s.b, dv=s.dv, b_material=s.b_material, y=s.y
+        )
+        return [*s.keep_directions(frames=False), rotate]
 
     def stages(
         self, assemble: Sequence[Launch], lists: Sequence[Sequence[Launch]], effects: Sequence[CouplesNodes]

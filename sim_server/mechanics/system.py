@@ -30,7 +30,8 @@ class Stencil:
     pair_start (blocks above the diagonal + 1,), pairs (k,): c^2 e + c a + b, the corners of e that couple in a block.
 
     Of strain cells with any number of nodes (clusters.py) corners are their slots, pairs (k, 2) the slots that couple;
-    corner_owners, pair_owners: the cell of each; patches: the same of their patches.
+    corner_owners, pair_owners: the cell of each; patches: the same of their patches; dilating: of cells that have a
+    dilatation alone, None if there are none.
     """
 
     corner_start: Int32
@@ -40,6 +41,7 @@ class Stencil:
     corner_owners: Int32 | None = None
     pair_owners: Int32 | None = None
     patches: "Stencil | None" = None
+    dilating: "Stencil | None" = None
 
 
 class System:
@@ -138,7 +140,7 @@ class System:
     def finish(self, matrix: bool = True) -> list[Launch]:
         """Takes the system into the material frame, A' = R^T A R and b' = R^T b, and sets the start of the solve.
 
-        matrix: A', too
+        matrix: A', too. Rollers (mechanics/rollers.py) come first.
         """
         w = self.world
         velocity = w.v if w.inertia else w.predictor  # without inertia v is only the last displacement over dt
@@ -148,13 +150,24 @@ class System:
             x=w.x, v=velocity, extent=self.extent, inverse_time=self.inverse_time, h=w.dt, whole=int(matrix),
             moving=self.moving, rotation=self.rotation, b_material=self.b_material, y=self.y, values=self.values,
         )  # fmt: skip
+        kept = self.keep_directions(frames=True)
         if not matrix:
-            return [rotate]
+            return [*kept, rotate]
         rotate_blocks = self.world.backend.module("kernels/rotate_blocks.cu").bind(
             "rotate_blocks", len(self.row), row=self.row, column=self.column, upper=self.upper, lower=self.lower,
             sums=self.sums, rotation=self.rotation, values=self.values,
         )  # fmt: skip
+        if w.rollers is not None:
+            own, others = w.rollers.keep_matrix(self.block, self.sums, self.row, self.column)
+            return [*kept, own, rotate, others, rotate_blocks]
         return [rotate, rotate_blocks]
+
+    def keep_directions(self, frames: bool) -> list[Launch]:
+        """Takes b to the directions in which nodes may move; nothing in a scene without rollers. frames: these, too."""
+        rollers = self.world.rollers
+        if rollers is None:
+            return []
+        return [rollers.keep_force(self.b), *([rollers.keep_frame(self.mean)] if frames else [])]
 
     def advance(self, before: Float64) -> Launch:
         """Advances by backward Euler: v += R y, x += h v. before (n, 3): gets x at the start of the step [m]."""
@@ -205,15 +218,15 @@ def _couplings(elements: Int32, world: World, n: int) -> tuple[Int64, Int32]:
     return np.concatenate(keys), np.concatenate(pairs)
 
 
-def _patched(elements: PatchedCells, world: World) -> tuple[Couplings, Couplings]:
-    return clusters.couplings(elements.cells, world), clusters.couplings(elements.patches, world)
+def _patched(elements: PatchedCells, world: World) -> list[Couplings]:
+    return [clusters.couplings(each, world) for each in (elements.cells, elements.patches, elements.dilating)]
 
 
-def _patched_stencil(
-    elements: PatchedCells, found: tuple[Couplings, Couplings], n: int, blocks: Int64
-) -> Stencil:  # fmt: skip
-    patches = Stencil(*clusters.places(elements.patches, found[1], n, blocks))
-    return Stencil(*clusters.places(elements.cells, found[0], n, blocks), patches)
+def _patched_stencil(elements: PatchedCells, found: list[Couplings], n: int, blocks: Int64) -> Stencil:
+    groups = elements.cells, elements.patches, elements.dilating
+    cells, patches, dilating = (clusters.places(g, f, n, blocks) for g, f in zip(groups, found, strict=True))
+    alone = Stencil(*dilating) if len(elements.dilating.nodes) else None
+    return Stencil(*cells, Stencil(*patches), alone)
 
 
 def _stencil(elements: Int32, couplings: tuple[Int64, Int32], n: int, blocks: Int64) -> Stencil:

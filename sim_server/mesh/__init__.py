@@ -61,12 +61,13 @@ class Mesh:
         return replace(self, rest=rest, tets=sub_tetrahedra(rest, quadratic), quadratic=quadratic)
 
 
-def bar(cells: Sequence[int], size: Sequence[float], split: str = "kuhn") -> Mesh:
+def bar(cells: Sequence[int], size: Sequence[float], split: str = "mirrored") -> Mesh:
     """A box of `size` [m] with a corner at the origin, each of its nx ny nz hexahedra split into 6 tetrahedra.
 
-    Kuhn split: one tetrahedron per order of the axes along which a path leads from the lowest corner of the cell to
-    the opposite one, so neighbouring cells match. All its diagonals point one way, so that a coarse bar under bending
-    also twists. "mirrored" turns the split over from cell to cell along each axis: the same count, without that bias.
+    "kuhn": one tetrahedron per order of the axes along which a path leads from the lowest corner of the cell to the
+    opposite one, so neighbouring cells match. All its diagonals point one way: a coarse bar under bending also twists,
+    and is too stiff, the more so the nearer Poisson's ratio is to 0.5. "mirrored" turns the split over from cell to
+    cell along each axis: the same count, without that bias.
     Nodes are numbered x fastest, then y, then z; so are the cells.
     Raises InputError unless there are three counts >= 1 and three finite sizes > 0.
     """

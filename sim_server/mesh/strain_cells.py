@@ -5,9 +5,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sim_server.arrays import Float64, Int32, Int64
 
+DEVIATOR, DILATATION = 1, 2  # what a cell counts for; their sum: both
 WINDOW = 256  # cells among which those of as many nodes come together, so that they fill the same slices
 
 
@@ -18,9 +20,11 @@ class StrainCells:
     start: int32 (m + 1,), where the nodes of each cell begin
     nodes: int32 (k,), body-local node numbers, cell after cell
     gradients: float64 (k, 3) [1/m]; sum to 0 in each cell
-    volume: float64 (m,) [m3]; sums to the body's volume
+    volume: float64 (m,) [m3]; of the cells of each role it sums to the body's volume
     element: int32 (m,), a tetrahedron (row of Mesh.tets) whose material constants the cell has
     patch: int32 (m,), number of its patch, 0 to patches - 1, without gaps
+    role: int32 (m,), DEVIATOR where the cell has that strain alone, DILATATION where only the mean dilatation of the
+        patch is taken from it; None: every cell has both
     """
 
     start: Int32
@@ -29,11 +33,16 @@ class StrainCells:
     volume: Float64
     element: Int32
     patch: Int32
+    role: Int32 | None = None
 
     @property
     def patches(self) -> int:
         """Number of patches."""
         return int(self.patch.max(initial=-1)) + 1
+
+    def has(self, role: int) -> NDArray[np.bool_]:
+        """Whether each cell counts for DEVIATOR or for DILATATION, (m,)."""
+        return np.ones(len(self.volume), bool) if self.role is None else (self.role & role) > 0
 
     def in_order(self) -> "StrainCells":
         """Returns the same with cells patch after patch, in each window sorted by their number of nodes."""
@@ -47,8 +56,9 @@ class StrainCells:
         start = np.concatenate([[0], np.cumsum(sizes)]).astype(np.int32)
         rows = np.arange(start[-1]) + np.repeat(self.start[:-1][order] - start[:-1], sizes)
         return StrainCells(
-            start, self.nodes[rows], self.gradients[rows], self.volume[order], self.element[order], self.patch[order]
-        )
+            start, self.nodes[rows], self.gradients[rows], self.volume[order], self.element[order], self.patch[order],
+            None if self.role is None else self.role[order],
+        )  # fmt: skip
 
 
 def joined(parts: Sequence[StrainCells], bodies: Sequence[tuple[int, int]]) -> StrainCells:
@@ -67,4 +77,5 @@ def joined(parts: Sequence[StrainCells], bodies: Sequence[tuple[int, int]]) -> S
         np.concatenate([p.volume for p in parts]),
         np.concatenate([p.element + n[1] for p, _, n in numbers]),
         np.concatenate([p.patch + n[2] for p, _, n in numbers]),
+        np.concatenate([(p.has(DEVIATOR) + 2 * p.has(DILATATION)).astype(np.int32) for p in parts]),
     )

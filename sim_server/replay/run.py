@@ -31,7 +31,7 @@ from sim_server.recording import messages
 from sim_server.recording.obstacles import obstacle_messages, targets_of
 from sim_server.replay.log import Recording
 from sim_server.replay.report import Comparison
-from sim_server.scene import Scene, deleted
+from sim_server.scene import Scene, deleted, earlier_defaults
 from sim_server.scene.messages import readable
 from sim_server.simulation import Simulation
 from sim_server.state.start import Start
@@ -50,7 +50,7 @@ class Replay:
     def __init__(self, recording: Recording):
         self.recording = recording
         try:
-            table = _without_skins(deleted.without(json.loads(recording.scene.resolved)))
+            table = _without_skins(deleted.without(earlier_defaults.named(json.loads(recording.scene.resolved))))
             if table.get("solver", {}).get("warp") == "auto":
                 table["solver"]["warp"] = True
                 recording.notes.append(

@@ -18,8 +18,8 @@ BELONGS = {
 def checked_effects(scope: str, table: Any, context: Any = None) -> dict[str, BaseModel]:
     """Returns the validated parameters of each effect in `table`, in the order of the file.
 
-    An effect is a table, or `true` for its defaults; one that is `false` is absent. Raises ValidationError with every
-    error in the table, each with its place.
+    An effect is a table, or `true` for its defaults; one that is `false` is absent. A list of tables stands for the key
+    `tables` of an effect that has it. Raises ValidationError with every error in the table, each with its place.
 
     scope: "scene" or "object", where the table stands
     context: of the validation, with the `folder` of the scene file
@@ -51,6 +51,8 @@ def _checked(scope: str, name: str, values: Any, context: Any) -> BaseModel | No
         raise _error(f"effect {name!r} does not belong here; {BELONGS[module.SCOPE]}", values)
     if isinstance(values, module.Params):
         return values
+    if isinstance(values, list) and "tables" in module.Params.model_fields:
+        values = {"tables": values}
     if values is not True and not isinstance(values, dict):
         raise _error("must be a table of parameters, true (its defaults) or false (absent)", values)
     return module.Params.model_validate({} if values is True else values, context=context)

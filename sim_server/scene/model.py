@@ -43,12 +43,21 @@ class MeshSource(Parameters):
     bar: Counts | None = Field(default=None, description="cells along x, y, z; each is split into 6 tetrahedra")
     size: Sizes | None = Field(default=None, description="size of the bar along x, y, z [m]")
     split: Literal["kuhn", "mirrored"] | None = Field(
-        default=None, description="split of the cells of a bar: kuhn (default), or mirrored, which bends without twist"
+        default=None,
+        description="split of the cells of a bar: mirrored (default), or kuhn, which bends less, with a twist",
     )
     scale: Positive | None = Field(
         default=None, description="scale of the coordinates in a file: 0.001 for a mesh in mm"
     )
     file: File | None = Field(default=None, description="a file that meshio reads")
+
+    @model_validator(mode="before")
+    @classmethod
+    def _named_split(cls, table: Any) -> Any:
+        """Names the split of a bar, so that a log or a checkpoint tells it whatever the default is when it is read."""
+        if isinstance(table, dict) and table.get("bar") is not None and table.get("split") is None:
+            return {**table, "split": "mirrored"}
+        return table
 
     @model_validator(mode="after")
     def _one_source(self) -> "MeshSource":
@@ -129,8 +138,8 @@ class SceneObject(Parameters):
                 mesh = read(source.file, self._keeps_mid_nodes)
                 mesh = check(replace(mesh, rest=mesh.rest * (source.scale or 1.0)))
             else:
-                assert source.bar is not None and source.size is not None
-                mesh = bar(source.bar, source.size, source.split or "kuhn")
+                assert source.bar is not None and source.size is not None and source.split is not None
+                mesh = bar(source.bar, source.size, source.split)
             return mesh.with_mid_nodes() if self.elements == "quadratic" else mesh
         except InputError as error:
             raise InputError(f"object {self.name!r}: {error}") from error

@@ -5,6 +5,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim_server.mechanics.world import Body
+from sim_server.service.locking_note import locking_notes
 from sim_server.simulation import Simulation
 
 NEARLY_INCOMPRESSIBLE = 0.4999  # Poisson's ratio; beyond it solves were seen to miss their tolerance
@@ -12,12 +13,13 @@ NAMED = 3  # objects named in a line
 
 
 def scene_notes(simulation: Simulation) -> list[str]:
-    """Returns at most two lines: bodies that fall apart or fall freely, and nearly incompressible materials.
+    """Returns lines: bodies that fall apart or fall freely, nearly incompressible materials, and elements that lock.
 
-    A body falls if gravity acts on it and no element connects it to a fixed node, even if clients may grab it; not
-    where there are obstacles, on which it may land. In a quasi-static scene such a body is refused.
+    A body falls if gravity acts on it and no element connects it to a fixed node or a roller, even if clients may grab
+    it; not where there are obstacles, on which it may land. In a quasi-static scene such a body is refused.
     """
-    return [line for line in (_loose(simulation), _incompressible(simulation)) if line]
+    locking = [f"{_names(bodies)} {text}" for bodies, text in locking_notes(simulation)]
+    return [line for line in (_loose(simulation), _incompressible(simulation), *locking) if line]
 
 
 def _loose(simulation: Simulation) -> str:
@@ -28,7 +30,10 @@ def _loose(simulation: Simulation) -> str:
         and world.at_start(world.gravity_of).any()
     )
     part, elastic = _parts(simulation)
-    held = np.isin(part, part[world.free == 0])
+    fixed = world.free == 0
+    if world.rollers is not None:
+        fixed |= world.rollers.limited > 0
+    held = np.isin(part, part[fixed])
     apart, falling, partly = [], [], []
     for body in world.bodies:
         loose = int((~held[body.nodes]).sum())
@@ -79,7 +84,7 @@ def _incompressible(simulation: Simulation) -> str:
     bodies = [simulation.world.bodies[b] for b in sorted(above)]
     return (
         f"{_names(bodies)} with a Poisson's ratio of {max(above.values()):.10g}: above {NEARLY_INCOMPRESSIBLE} solves "
-        "may not reach their tolerance, and linear tetrahedra lock"
+        "may not reach their tolerance"
     )
 
 

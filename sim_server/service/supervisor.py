@@ -7,6 +7,7 @@ all, and kill them.
 """
 
 import logging
+import os
 import subprocess
 import sys
 import time
@@ -64,7 +65,8 @@ class Supervisor:
     ):  # fmt: skip
         endpoints = [word for endpoint in connect for word in ("--connect", endpoint)]
         self._command = [
-            sys.executable, "-m", "precond_worker", "--exit-with-parent", "--server", server, *endpoints, *arguments
+            sys.executable, "-m", "precond_worker", "--exit-with-parent", "--parent", str(os.getpid()),
+            "--server", server, *endpoints, *arguments,
         ]  # fmt: skip
         self._clock, self._popen = clock, start
         self.workers = [_Process(f"local-{i + 1}") for i in range(count)]

@@ -27,7 +27,7 @@ dt = 0.02
 gravity = { g = [0, -9.81, 0] }
 [[object]]
 name = "bar"
-mesh = { bar = [2, 2, 8], size = [1, 1, 4] }
+mesh = { bar = [2, 2, 8], size = [1, 1, 4], split = "kuhn" }
 [object.effects]
 stable_neo_hookean = { young = 1e6, poisson = 0.45 }
 rayleigh = { mass = 0.1 }

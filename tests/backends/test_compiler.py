@@ -302,6 +302,30 @@ ELEMENTS = [
     ("effects/corotational_exact.cu", "CorotationalExactElements", "corotational_exact.elements"),
     ("effects/mass_spring.cu", "Springs", "mass_spring.springs"),
 ]  # fmt: skip
+CELLS = [
+    ("effects/corotational_cells.cu", "CorotationalCells", "corotational_cells.measure"),
+    ("effects/corotational_cells.cu", "CorotationalCells", "corotational_cells.measure_near"),
+]
+CELL_ELEMENTS = [
+    ("effects/corotational_cells.cu", "CorotationalCellElements", "corotational_cells.elements"),
+    ("effects/corotational_cells.cu", "CorotationalExactCellElements", "corotational_cells.exact_elements"),
+    ("effects/corotational_cells.cu", "CorotationalCellImpulses", "corotational_cells.impulses"),
+]
+CELL_NODES = [
+    NODES[0],
+    ("effects/corotational_cell_sums.cu", "CellNodes", "corotational_cell_sums.gather"),
+    ("effects/corotational_cell_sums.cu", "ExactCellNodes", "corotational_cell_sums.gather_exact"),
+    ("effects/corotational_patches.cu", "PatchNodes", "corotational_patches.own_blocks"),
+    ("effects/corotational_cell_sums.cu", "TwistNodes", "corotational_cell_sums.gather_twists"),
+    *NODES[-1:],
+]
+CELL_BLOCKS = [
+    ("effects/corotational_cell_sums.cu", "CellBlocks", "corotational_cell_sums.blocks"),
+    ("effects/corotational_cell_sums.cu", "ExactCellBlocks", "corotational_cell_sums.blocks_exact"),
+    ("effects/corotational_patches.cu", "PatchBlocks", "corotational_patches.blocks"),
+    ("effects/corotational_cell_sums.cu", "TwistBlocks", "corotational_cell_sums.twist_blocks"),
+    ("kernels/rotate_blocks.cu", "RotateBlocks", "rotate_blocks.rotate_blocks"),
+]
 LAW_ELEMENTS = [
     (f"{FRAME}+effects/neo_hookean.cuh", "HyperelasticElements", "neo_hookean.elements"),
     (f"{FRAME}+effects/mooney_rivlin.cuh", "HyperelasticElements", "mooney_rivlin.elements"),
@@ -321,8 +345,18 @@ BLOCKS = [
 @pytest.mark.parametrize(("real", "local"), [("double", "double"), ("double", "float"), ("float", "float")])
 @pytest.mark.parametrize(
     "group",
-    [NODES, OTHER_SCHEME, BLOCKS, ELEMENTS, LAW_ELEMENTS],
-    ids=["nodes", "other scheme", "blocks", "elements", "laws"],
+    [NODES, OTHER_SCHEME, BLOCKS, ELEMENTS, LAW_ELEMENTS, CELLS, CELL_ELEMENTS, CELL_NODES, CELL_BLOCKS],
+    ids=[
+        "nodes",
+        "other scheme",
+        "blocks",
+        "elements",
+        "laws",
+        "cells",
+        "their elements",
+        "their nodes",
+        "their blocks",
+    ],
 )
 def test_launches_put_together_compile_in_every_precision(group, real, local, tmp_path, monkeypatch):
     """With rows in registers, and one argument for each array whatever launches have it."""
@@ -335,7 +369,9 @@ def test_launches_put_together_compile_in_every_precision(group, real, local, tm
     assert together == launches
     shape = kernel_fusion.BlockShape(64, 4)
     made = kernel_fusion.FusedSource(launches, shape, None, private)  # type: ignore[arg-type]
-    assert (group in (ELEMENTS, LAW_ELEMENTS) or private) and made.source.count("[3];") >= len(private)
+    assert (group in (ELEMENTS, LAW_ELEMENTS, CELLS, CELL_ELEMENTS) or private) and made.source.count("[3];") >= len(
+        private
+    )
     text = tmp_path / "together.cu"
     text.write_text(made.source)
     options = ["-arch=sm_90", "-std=c++17", f"-Dreal={real}", f"-Dlocal={local}", f"-I{backend.INCLUDE}"]

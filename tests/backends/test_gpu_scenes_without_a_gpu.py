@@ -100,6 +100,17 @@ def test_a_scene_is_built_and_its_kernels_compile(cupy, name):
     assert engine.factor_bytes(body.index) > 9 * nodes
 
 
+@pytest.mark.parametrize("tangent", ["usual", "exact"])
+def test_launches_over_cells_and_patches_are_put_together_by_domain(cupy, tangent):
+    """Cells, patches, elements, corners of patches, nodes, blocks: one kernel each, and the end of the step."""
+    keys = ["object.beam.elements=smoothed", f"object.beam.effects.corotational.tangent={tangent}"]
+    Simulation.load("deploy/scenes/beam.toml", keys, "gpu")
+    names = [kernel for kernel, _ in cupy.calls]
+    alone = {"measure", "means", "elements", "exact_elements", "gather", "gradients", "own_blocks", "blocks"}
+    assert not (alone | {"gather_impulses", "gather_twists", "twist_blocks"}) & set(names)
+    assert names[: names.index("pcg")].count("fused") >= 6
+
+
 def written_back(simulation):
     """Reads and writes all state of a simulation."""
     arrays = state_arrays(simulation)
@@ -137,6 +148,22 @@ def test_a_scene_with_explicit_substeps_is_built(cupy, name, precision):
     assert "pcg" not in names and names[first:last].count("fused") >= 8 and "measure_frequency" in names[first:last]
     engine.run(3)
     assert engine.step == 3
+
+
+@pytest.mark.parametrize(
+    ("scheme", "precision"), [("backward_euler", "mixed"), ("ros2", "float64"), ("central_difference", "float32")]
+)
+def test_rollers_and_loads_on_surfaces_are_built(cupy, scheme, precision):
+    """Their launches join the kernels over elements, nodes and blocks."""
+    given = bar((2, 1, 1), fixed="X < 0.01")
+    given["effects"]["fixed"] = [{"where": "X < 0.01"}, {"where": "Y < 0.01", "along": "y"}]
+    given["effects"]["traction"] = {"where": "X > 1.99", "force": [1, 0, 0], "pressure": 2.0, "moment": [0, 1, 0]}
+    sim = Simulation(scene(given, integrator={"scheme": scheme}, precision=precision), "gpu")
+    sim.engine.run(3)
+    assert sim.engine.step == 3
+    names = "+".join(x.name for x in sim.step_launches)
+    assert "traction.areas" in names and "traction.load" in names and "rollers.keep_force" in names
+    assert ("roller_blocks.keep_blocks" in names) == (scheme != "central_difference")
 
 
 @pytest.mark.parametrize("scheme", ["backward_euler", "central_difference"])

@@ -41,7 +41,7 @@ def edge() -> list[dict]:
 
 def fork(folder: Path, cells: tuple[int, int, int] = (8, 5, 2), edge: float = 0.01) -> dict[str, str]:
     """The mesh of two arms along x, two cells thick, that a back at x = 0 joins."""
-    mesh = bar_mesh(cells, [edge * c for c in cells])
+    mesh = bar_mesh(cells, [edge * c for c in cells], "kuhn")
     middle = mesh.rest[mesh.tets].mean(axis=1) / edge
     kept = mesh.tets[~((middle[:, 0] > 2) & (abs(middle[:, 1] - cells[1] / 2) < cells[1] / 2 - 2))]
     used, tets = np.unique(kept, return_inverse=True)

@@ -14,7 +14,7 @@ DT = 0.01
 CUBE = """
 [[object]]
 name = "{name}"
-mesh = {{ bar = [2, 2, 2], size = [0.1, 0.1, 0.1] }}
+mesh = {{ bar = [2, 2, 2], size = [0.1, 0.1, 0.1], split = "kuhn" }}
 pose = {{ translate = {at}, rotate = {turned} }}
 [object.effects]
 corotational = {{ young = 1e5, poisson = 0.4 }}

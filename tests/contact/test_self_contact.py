@@ -146,7 +146,9 @@ def test_an_arm_at_rest_on_the_other_one_is_in_balance(tmp_path):
 
 def test_a_strip_that_falls_on_itself_comes_to_rest_on_itself():
     pose = {"rotate": [0, 0, 88], "translate": [0, 0.001, 0]}
-    strip = body({"bar": [24, 1, 2], "size": [0.24, 0.005, 0.02]}, young=3e3, damping=(4.0, 0.004), pose=pose)
+    strip = body(
+        {"bar": [24, 1, 2], "size": [0.24, 0.005, 0.02], "split": "kuhn"}, young=3e3, damping=(4.0, 0.004), pose=pose
+    )
     lockstep = {"preconditioner": "cholesky", "update": "lockstep-3"}
     sim = made(strip, gravity=(0, -9.81, 0), dt=0.01, solver=lockstep, obstacle=[floor()])
     for _ in range(20):
@@ -172,7 +174,7 @@ def test_same_motion_with_each_preconditioner(tmp_path):
 @pytest.mark.parametrize("bend", ["rolled", "twisted", "pressed"])
 def test_a_thin_body_does_not_detect_its_own_other_side(bend):
     """Bent by three quarters of a circle, twisted by two turns, or to half its length, with the largest thickness."""
-    mesh = {"bar": [30, 1, 3], "size": [0.3, 0.01, 0.03]}
+    mesh = {"bar": [30, 1, 3], "size": [0.3, 0.01, 0.03], "split": "kuhn"}
     sim = made(body(mesh), contact={"thickness": 0.004})
     w, x = sim.world, sim.world.rest
     if bend == "rolled":
@@ -238,11 +240,11 @@ def test_two_bodies_that_touch_each_other_and_themselves(tmp_path):
 
 
 def test_a_body_that_begins_through_itself_is_told(tmp_path, caplog):
-    mesh = bar_mesh((8, 1, 1), (0.08, 0.01, 0.01))
+    mesh = bar_mesh((8, 1, 1), (0.08, 0.01, 0.01), "kuhn")
     rest = mesh.rest.copy()
     angle = rest[:, 0] / 0.08 * 2.2 * np.pi  # rolled up until its ends are in each other
     rest[:, 0], rest[:, 1] = (0.012 + rest[:, 1]) * np.sin(angle), -(0.012 + rest[:, 1]) * np.cos(angle)
-    turned = bar_mesh((8, 1, 1), (0.08, 0.01, 0.01)).tets[:, [0, 2, 1, 3]]
+    turned = bar_mesh((8, 1, 1), (0.08, 0.01, 0.01), "kuhn").tets[:, [0, 2, 1, 3]]
     with caplog.at_level(logging.WARNING):
         made(body(mesh_file(tmp_path, rest, turned)))
     assert "'body' begins passing through itself" in caplog.text

@@ -40,7 +40,7 @@ BY_HAND = {
     ("Holders", "max_turn"): ("3", None),
     ("Holders", "keyframes"): (None, "at least one"),
     ("Springs", "between"): (None, "two of"),
-    ("Objects", "mesh.split"): ('"kuhn"', None),
+    ("Objects", "mesh.split"): ('"mirrored"', None),
     ("Objects", "mesh.scale"): ("1", None),
 }
 

@@ -22,7 +22,7 @@ SIZE = np.array([0.6, 0.3, 0.2])
 
 def box(cells: tuple[int, int, int] = (4, 3, 2)) -> tuple[np.ndarray, np.ndarray]:
     """Points and triangles of a box about the origin."""
-    mesh = bar_mesh(cells, SIZE)
+    mesh = bar_mesh(cells, SIZE, "kuhn")
     return mesh.rest - SIZE / 2, surface_triangles(mesh.tets).astype(np.int64)
 
 
@@ -39,7 +39,7 @@ def ball(count: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
 
 def notched() -> tuple[np.ndarray, np.ndarray]:
     """A cube of 2 x 2 x 2 cells without one of them: an edge and a corner that lead inward."""
-    mesh = bar_mesh((2, 2, 2), (2, 2, 2))
+    mesh = bar_mesh((2, 2, 2), (2, 2, 2), "kuhn")
     tets = mesh.tets[~(mesh.rest[mesh.tets].mean(axis=1) > 1).all(axis=1)]
     return mesh.rest, surface_triangles(tets).astype(np.int64)
 
@@ -166,7 +166,7 @@ def of_grid(path, **grid) -> Simulation:
 
 @pytest.mark.parametrize("volume", [False, True])
 def test_a_grid_of_a_box_finds_what_the_box_finds(tmp_path, volume):
-    mesh = bar_mesh((4, 3, 2), SIZE)
+    mesh = bar_mesh((4, 3, 2), SIZE, "kuhn")
     points, triangles = box()
     cells = [("tetra", mesh.tets)] if volume else [("triangle", triangles)]
     meshio.Mesh(1000 * points, cells).write(tmp_path / "box.vtk")

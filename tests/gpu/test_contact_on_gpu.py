@@ -215,7 +215,7 @@ def test_a_recorded_run_is_the_same_bit_for_bit(tmp_path: Path) -> None:
         preconditioner = "cholesky"
         [[object]]
         name = "block"
-        mesh = { bar = [4, 3, 4], size = [0.1, 0.06, 0.1] }
+        mesh = { bar = [4, 3, 4], size = [0.1, 0.06, 0.1], split = "kuhn" }
         pose = { translate = [0, 0.02, 0] }
         density = 1000
         friction = 0.2

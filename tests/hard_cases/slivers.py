@@ -20,7 +20,7 @@ def sliver_bar(
 ) -> Simulation:
     """A scene's bar on that mesh, which goes through a file as a user's would."""
     path = folder / "slivers.vtu"
-    mesh = bar(list(cells), [1, 1, 4])
+    mesh = bar(list(cells), [1, 1, 4], "kuhn")
     rest, cell = mesh.rest.copy(), 4 / cells[2]
     above = rest[:, 2] > (cells[2] // 2 + 0.5) * cell
     rest[above, 2] -= (1 - THICKNESS) * cell

@@ -66,7 +66,7 @@ def test_vertices_on_nodes_edges_and_faces_are_inside(mesh: Mesh) -> None:
 
 def test_beside_small_tetrahedra_a_large_one_is_found() -> None:
     """The nearest middle of a tetrahedron is that of another one."""
-    small = bar_mesh((4, 4, 4), (0.1, 0.1, 0.1))
+    small = bar_mesh((4, 4, 4), (0.1, 0.1, 0.1), "kuhn")
     large = np.array([[-10.0, 0, 0], [0, 0, 0], [-5, 5, 0], [-5, 0, 5]]) - [0.01, 0, 0]
     mesh = Mesh(
         np.concatenate([small.rest, large]), np.concatenate([small.tets, [[125, 126, 127, 128]]]).astype(np.int32)
@@ -87,7 +87,7 @@ def test_weights_at_flat_tetrahedra_are_bounded() -> None:
 
 
 def write_scene(folder: Path, skin: str) -> Path:
-    box = bar_mesh((4, 2, 2), (2000, 1000, 1000))
+    box = bar_mesh((4, 2, 2), (2000, 1000, 1000), "kuhn")
     meshio.write(folder / "liver.vtu", meshio.Mesh(box.rest, [("tetra", box.tets)]))
     (folder / "scene.toml").write_text(SCENE.format(skin=skin))
     return folder / "scene.toml"

@@ -13,10 +13,11 @@ from sim_server.simulation import Simulation
 from tests.state import put
 
 FIXED = {"fixed": {"where": "X < 0.01"}}
-BAR = {"bar": [3, 1, 1], "size": [1.5, 0.5, 0.5]}
+BAR = {"bar": [3, 1, 1], "size": [1.5, 0.5, 0.5], "split": "kuhn"}
 REGIONS = [{"where": "X < 0.7", "young": 2e5}, {"young": 5e4, "poisson": 0.2}]
 YOUNG = {"young": 1e5, "poisson": 0.3}
 STRETCHED = {"direction": [[1, 0, 0], [0, 1, 0]]}
+LOADS = {"where": "X > 1.49", "force": [0, 30, 0], "stress": [5, 0, 0], "pressure": 40.0, "moment": [0, 9, 3]}
 
 
 class Case(NamedTuple):
@@ -64,6 +65,9 @@ CASES = {
                    {"bar.fibres.stiffness": 9e4, "bar.fibres.exponent": 2.0, "bar.fibres.direction": [0, 1, 1]}),
     "rayleigh": Case({"corotational": YOUNG, "rayleigh": {"mass": 0.1}},
                      {"bar.rayleigh.mass": 3.0, "bar.rayleigh.stiffness": 0.02}),
+    "traction": Case({"corotational": YOUNG, "traction": LOADS},
+                     {"bar.traction.force": [9, 3, 0], "bar.traction.stress": [0, 90, 0],
+                      "bar.traction.pressure": -60.0, "bar.traction.moment": [0, 4, -5]}),
     "gravity": law("corotational", YOUNG)._replace(values={"gravity.g": [4.0, 1.0, 0.0]}),
     "friction": Case({"corotational": YOUNG}, {"bar.friction": 0.2, "floor.friction": 0.1, "wall.friction": 0.3,
                      "contact.friction": [PAIR | {"value": 0.9}], "gravity.g": [1, -9, 0]}, CONTACT, True),

@@ -185,7 +185,7 @@ def test_listed_springs_hold_what_hangs_on_them():
     stretches each by m g / k beyond it, in the direction of gravity."""
     pairs = [[i, i + 1] for i in (0, 2, 4, 6)]  # along x
     springs = {"springs": pairs, "stiffness": [200.0, 100.0, 50.0, 100.0], "rest_length": 0.5}
-    cell: dict = {"mesh": {"bar": [1, 1, 1], "size": [1, 1, 1]}, "mass": 8.0, "masses": "equal"}
+    cell: dict = {"mesh": {"bar": [1, 1, 1], "size": [1, 1, 1], "split": "kuhn"}, "mass": 8.0, "masses": "equal"}
     table = springs_bar(springs, fixed="X < 0.01", damping=0.2, **cell)
     sim = simulation(table, gravity=(10.0, 0.0, 0.0), dt=0.1, tolerance=1e-12)
     held = np.flatnonzero(sim.world.free == 0)
@@ -201,7 +201,7 @@ def test_a_file_of_pairs(tmp_path):
     assert springs(sim).elements.tolist() == [[0, 1], [2, 3]]
     assert (springs(sim).stiffness == 3.0).all() and springs(sim).elastic == {}
     np.testing.assert_allclose(springs(sim).length, 0.5)
-    text = '[[object]]\nname = "bar"\nmesh = { bar = [4, 2, 2], size = [2, 1, 1] }\n[object.effects]\n'
+    text = '[[object]]\nname = "bar"\nmesh = { bar = [4, 2, 2], size = [2, 1, 1], split = "kuhn" }\n[object.effects]\n'
     (tmp_path / "scene.toml").write_text(f'dt = 0.02\n{text}mass_spring = {{ springs = "pairs.txt", stiffness = 3 }}\n')
     assert springs(Simulation.load(tmp_path / "scene.toml")).elements.tolist() == [[0, 1], [2, 3]]
     path.write_text("0 1\n2 -3\n")

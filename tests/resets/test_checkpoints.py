@@ -4,14 +4,18 @@
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
-from sim_server.checkpoint.content import capture, restore
+from sim_server.checkpoint.content import capture, digest, restore
 from sim_server.checkpoint.file import from_bytes, read
 from sim_server.errors import InputError
+from sim_server.scene.model import Scene
+from sim_server.simulation import Simulation
 from sim_server.updates.driver import Driver
 from tests.resets.going_on import check_that_it_goes_on
 from tests.resets.state_scenes import SCENES, made
+from tests.scenes import bar
 
 CASES = [(name, "every-3") for name in SCENES if name != "central_difference"] + [
     ("central_difference", "never"), ("bdf2", "lockstep-4"), ("friction", "lockstep-4"), ("ros2", "lockstep-3"),
@@ -22,6 +26,24 @@ CASES = [(name, "every-3") for name in SCENES if name != "central_difference"] +
 @pytest.mark.parametrize(("name", "update"), CASES)
 def test_a_run_goes_on_to_the_bit(name: str, update: str) -> None:
     check_that_it_goes_on(name, update)
+
+
+def test_a_checkpoint_of_a_version_with_another_default_goes_on_with_its_mesh() -> None:
+    """Bars were split as "kuhn" where a scene did not say how; a scene that does not say so now is another."""
+    table = {"name": "test", "dt": 0.02, "object": [bar((2, 2, 2), fixed="X < 0.01")]}
+    sim = Simulation(Scene.model_validate(table))
+    driver = Driver(sim)
+    driver.advance(2)
+    checkpoint = capture(sim, driver, "test")
+    del checkpoint.manifest["resolved"]["object"][0]["mesh"]["split"]  # as such a version wrote it
+    checkpoint.manifest["digest"] = digest(checkpoint.manifest["resolved"])
+    data = checkpoint.to_bytes()
+    again = Simulation(Scene.model_validate(table))
+    restore(again, from_bytes(data))
+    np.testing.assert_array_equal(again.fetch().x, sim.fetch().x)
+    del table["object"][0]["mesh"]["split"]
+    with pytest.raises(InputError, match=r"another scene \(object\[0\].mesh.split: saved with kuhn, here mirrored\)"):
+        restore(Simulation(Scene.model_validate(table)), from_bytes(data))
 
 
 def test_a_checkpoint_of_another_scene_or_a_damaged_one_is_refused(tmp_path: Path) -> None:

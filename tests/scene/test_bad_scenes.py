@@ -87,7 +87,7 @@ def test_what_is_wrong_with_several_keys_names_them_and_no_place(tmp_path):
         (swap("fixed =", "mass_spring = { springs = [[0, 1, 2]], stiffness = 1 }\nfixed ="), "object 'beam'", "effects.mass_spring.springs[1]", "(0, 1, 2)", ["2", "3"]),
         (swap("fixed =", 'mass_spring = { springs = "absent.txt", stiffness = 1 }\nfixed ='), "object 'beam'", "effects.mass_spring.springs", "'absent.txt'", ["no such file", "folder of the scene"]),
         (swap('"X < 0.01"', '"x < 0.01"'), "object 'beam'", "effects.fixed.where", "'x < 0.01'", ["'x'", "X", "Y", "Z"]),
-        (swap('{ where = "X < 0.01" }', "true"), "object 'beam'", "effects.fixed.where", "", ["missing"]),
+        (swap('{ where = "X < 0.01" }', "true"), "object 'beam'", "effects.fixed", "", ["where", "list"]),
         (swap('{ where = "X < 0.01" }', "3"), "object 'beam'", "effects.fixed", "3", ["table", "true", "false"]),
         (swap("corotational", "corotated"), "object 'beam'", "effects.corotated", "", ["'corotational'", "neo_hookean", "touch"]),
         (swap("fixed =", '"../fixed" ='), "object 'beam'", "effects.../fixed", "", ["'fixed'", "neo_hookean"]),

@@ -55,7 +55,7 @@ def test_bar_counts_volume_and_winding(cells, size, tets, nodes):
 @pytest.mark.parametrize(("cells", "size"), [([3, 3, 10], [1, 1, 4]), ([4, 2, 3], [1.5, 0.7, 2.0])])
 def test_bar_is_the_one_of_the_loops(cells, size):
     nodes, tets = bar_by_loops(cells, size)
-    mesh = bar(cells, size)
+    mesh = bar(cells, size, "kuhn")
     assert np.array_equal(mesh.rest, nodes)
     assert np.array_equal(mesh.tets, tets)
 
@@ -127,12 +127,12 @@ def test_pose_moves_after_turning_and_is_rigid():
     assert np.allclose(turn @ turn.T, np.eye(3), atol=1e-15) and np.linalg.det(turn) == pytest.approx(1)
 
 
-def test_the_mirrored_split_conforms_and_fills_the_box():
-    mesh = bar((3, 4, 5), (1, 2, 3), "mirrored")
+def test_the_mirrored_split_is_the_default_conforms_and_fills_the_box():
+    mesh = bar((3, 4, 5), (1, 2, 3))
     volume = volumes(mesh.rest, mesh.tets)
     assert len(mesh.tets) == 6 * 60 and volume.min() > 0
     assert np.isclose(volume.sum(), 6)
     assert len(surface_triangles(mesh.tets)) == 4 * (3 * 4 + 4 * 5 + 3 * 5)  # no face inside is left open
-    kuhn = bar((3, 4, 5), (1, 2, 3))
+    kuhn = bar((3, 4, 5), (1, 2, 3), "kuhn")
     assert np.array_equal(mesh.rest, kuhn.rest)
     assert not np.array_equal(mesh.tets, kuhn.tets)

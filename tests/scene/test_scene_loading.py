@@ -83,7 +83,7 @@ def test_defaults_and_resolved(tmp_path):
         "object": [
             {
                 "name": "a",
-                "mesh": {"bar": [1, 1, 1], "size": [1.0, 1.0, 1.0]},
+                "mesh": {"bar": [1, 1, 1], "size": [1.0, 1.0, 1.0], "split": "mirrored"},
                 "pose": {"rotate": [0.0, 0.0, 0.0], "translate": [0.0, 0.0, 0.0]},
                 "density": 1000.0,
                 "masses": "volume",

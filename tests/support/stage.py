@@ -27,7 +27,7 @@ gravity = {{ g = [0, -9.81, 0] }}
 preconditioner = "cholesky"
 [[object]]
 name = "beam"
-mesh = {{ bar = [4, 4, 12], size = [1, 1, 4] }}
+mesh = {{ bar = [4, 4, 12], size = [1, 1, 4], split = "kuhn" }}
 [object.effects]
 corotational = {{ young = 1e6, poisson = 0.4 }}
 fixed = {{ where = "Z < 0.01" }}

@@ -24,7 +24,7 @@ preconditioner = "cholesky"
 {solver}
 [[object]]
 name = "beam"
-mesh = {{ bar = {bar}, size = [1, 1, 4] }}
+mesh = {{ bar = {bar}, size = [1, 1, 4], split = "kuhn" }}
 [object.effects]
 corotational = {{ young = 1e6, poisson = 0.4 }}
 rayleigh = {{ mass = 0.1 }}

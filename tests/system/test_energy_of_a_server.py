@@ -25,14 +25,14 @@ projection = "clamp"
 max_iterations = 5000
 [[object]]
 name = "soft"
-mesh = { bar = [6, 2, 2], size = [3, 0.5, 0.5] }
+mesh = { bar = [6, 2, 2], size = [3, 0.5, 0.5], split = "kuhn" }
 [object.effects]
 stable_neo_hookean = { young = 1.4e5, poisson = 0.4 }
 fixed = { where = "X < 0.01" }
 touch = true
 [[object]]
 name = "stiff"
-mesh = { bar = [4, 1, 1], size = [3, 0.5, 0.5] }
+mesh = { bar = [4, 1, 1], size = [3, 0.5, 0.5], split = "kuhn" }
 [object.effects]
 corotational = { young = 1e6, poisson = 0.4 }
 fixed = { where = "X < 0.01" }

@@ -32,7 +32,7 @@ contact = {{ thickness = 0.002 }}
 tolerance = 1e-10
 [[object]]
 name = "upper"
-mesh = {{ bar = [2, 2, 2], size = [0.1, 0.1, 0.1] }}
+mesh = {{ bar = [2, 2, 2], size = [0.1, 0.1, 0.1], split = "kuhn" }}
 pose = {{ translate = [0, 0.102, 0] }}
 [object.effects]
 corotational = {{ young = 1e5, poisson = 0.4 }}
@@ -40,7 +40,7 @@ rayleigh = {{ mass = 5 }}
 touch = {{ max_force = 100 }}
 [[object]]
 name = "lower"
-mesh = {{ bar = [2, 2, 2], size = [0.1, 0.1, 0.1] }}
+mesh = {{ bar = [2, 2, 2], size = [0.1, 0.1, 0.1], split = "kuhn" }}
 pose = {{ translate = [0.001, 0.001, 0.0] }}
 [object.effects]
 corotational = {{ young = 1e5, poisson = 0.4 }}

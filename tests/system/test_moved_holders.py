@@ -24,7 +24,7 @@ contact = true
 preconditioner = "cholesky"
 [[object]]
 name = "flap"
-mesh = { bar = [6, 2, 3], size = [0.3, 0.1, 0.15] }
+mesh = { bar = [6, 2, 3], size = [0.3, 0.1, 0.15], split = "kuhn" }
 [object.effects]
 corotational = { young = 1e5, poisson = 0.3 }
 fixed = { where = "X < 0.01" }

@@ -29,7 +29,7 @@ contact = true
 preconditioner = "cholesky"
 [[object]]
 name = "cube"
-mesh = {{ bar = [3, 3, 3], size = [0.3, 0.3, 0.3] }}
+mesh = {{ bar = [3, 3, 3], size = [0.3, 0.3, 0.3], split = "kuhn" }}
 [object.effects]
 corotational = {{ young = 1e5, poisson = 0.3 }}
 touch = true

@@ -132,6 +132,13 @@ def test_of_two_of_one_name_that_join_at_the_same_instant_one_leaves() -> None:
             assert stays.poll() is None
 
 
+def test_it_ends_at_once_if_its_parent_is_another_one_by_now() -> None:
+    """As when the parent dies before the child asks to be told."""
+    with process("-m", "precond_worker", "--exit-with-parent", "--parent", "1", "--connect", free_endpoint()) as child:
+        assert child.wait(40) == 0
+        assert child.stdout is not None and child.stdout.read() == ""
+
+
 def test_it_ends_with_its_parent() -> None:
     endpoint = free_endpoint()
     parent = (

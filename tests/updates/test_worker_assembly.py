@@ -24,7 +24,7 @@ SOLIDS = {
     "corotational": bar((4, 2, 2), damping=(0.1, 0.02), fixed="X < 0.01"),
     "regions": bar((4, 2, 2), young=[{"where": "X < 1", "young": 1e6}, {"young": 1e4}], fixed="X < 0.01"),
     "posed": bar((4, 2, 2), pose={"rotate": [40, 0, 70], "translate": [1, 2, 3]}, fixed="X < 0.01"),
-    "springs": {"name": "bar", "mesh": {"bar": [4, 2, 2], "size": [2, 1, 1]}, "effects": SPRINGS},
+    "springs": {"name": "bar", "mesh": {"bar": [4, 2, 2], "size": [2, 1, 1], "split": "kuhn"}, "effects": SPRINGS},
     "equal masses": bar((4, 2, 2), mass=5.0, masses="equal"),
 }
 

@@ -137,6 +137,7 @@ extern "C" __global__ void __launch_bounds__(THREADS) end_round(const Substeps p
             const double step[3] = {(double)x[0] - from[0], (double)x[1] - from[1], (double)x[2] - from[2]};
             sums.work += work_on(e.force + 3ll * i, e.spring[i], e.anchor + 3ll * i, from, step);
         }
+        sums.work += load_work_over(e, e.first_node[body], e.first_node[body + 1]);
         sums = sums_of_block(sums);
         if (threadIdx.x == 0) {
             Balance balance = e.balance[body];

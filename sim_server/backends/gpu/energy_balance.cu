@@ -21,6 +21,7 @@ struct EnergyBalance {
     real* force;                // (n, 3) of touches (effects/touch.cu); null: nothing can be touched
     real* spring;               // (n,)
     real* anchor;               // (n, 3)
+    const real* load;           // (n, 3) of surfaces (effects/traction.cu), or null
     real* free;                 // (n,) set to 0 where a body is frozen
     const real* gravity;        // (3,) [m/s2]
     Balance* balance;           // (bodies,)
@@ -51,6 +52,14 @@ __device__ __forceinline__ Sums sums_over(const EnergyBalance& a, int begin, int
         add_node(s, a.mass[i], x, a.v + 3ll * i, step, a.gravity);
     }
     return s;
+}
+
+// Work of loads on surfaces.
+__device__ __forceinline__ double load_work_over(const EnergyBalance& a, int begin, int end) {
+    double work = 0;
+    for (long long i = begin + threadIdx.x; a.load && i < end; i += blockDim.x)
+        for (long long k = 3 * i; k < 3 * i + 3; ++k) work += (double)a.load[k] * ((double)a.x[k] - a.before[k]);
+    return work;
 }
 
 // Work of touch forces on the same nodes; sets the forces to 0 until the next touch.
@@ -144,6 +153,7 @@ __device__ void balance_energy(const EnergyBalance& a, int number) {
     Sums s = sums_over(a, chunk.begin, chunk.end);
     if (settled == step) return;
     if (a.force) s.work = work_over(a, chunk.begin, chunk.end);
+    if (a.load) s.work += load_work_over(a, chunk.begin, chunk.end);
     s = sums_of_block(s);
     if (!gather(a, chunk, number, s)) return;
     if (threadIdx.x == 0) {

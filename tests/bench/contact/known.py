@@ -63,7 +63,7 @@ def hertz(cells: int, kappa: float = 100.0) -> list[Row]:
     """A rigid ball of 0.1 m radius pressed on a block of 0.6 x 0.3 x 0.6 m whose cells are small in the middle."""
     young, poisson, radius = 1e5, 0.3, 0.1
     size, count = np.array([0.6, 0.3, 0.6]), (cells, cells // 2, cells)
-    mesh = bar_mesh(count, tuple(size))
+    mesh = bar_mesh(count, tuple(size), "kuhn")
     u = 2 * mesh.rest / size - 1
     u[:, 1] = mesh.rest[:, 1] / size[1] - 1  # 0 at the top
     rest = 0.5 * size * _graded(u) * np.array([1, 2, 1])
@@ -112,7 +112,7 @@ def belt(friction: float, turned: float = 2.0, cells: int = 32) -> Row:
     inner = radius + d
     arc = np.pi * (inner + thick / 2)
     along = 2 * round(cells * tail / arc) + cells
-    mesh = bar_mesh((along, 1, 2), (along, thick, wide))
+    mesh = bar_mesh((along, 1, 2), (along, thick, wide), "kuhn")
     first = (along - cells) / 2
     s, r, z = mesh.rest[:, 0] - first, inner + mesh.rest[:, 1], mesh.rest[:, 2] - wide / 2
     angle, below = np.pi * np.clip(s / cells, 0, 1), np.maximum(np.maximum(-s, s - cells), 0) * arc / cells

@@ -249,7 +249,7 @@ def _distance(table: Row, given: Any, local: Reals) -> Reals:
 
 def _closed_surface(folder: Path) -> str:
     """Of a turned box of 0.1 x 0.08 x 0.1 m."""
-    mesh = bar_mesh((2, 2, 2), (0.1, 0.08, 0.1))
+    mesh = bar_mesh((2, 2, 2), (0.1, 0.08, 0.1), "kuhn")
     x = posed(mesh.rest - np.array([0.05, 0.04, 0.05]), (20, 10, 40), (0, 0, 0))
     file = folder / "surface.stl"
     meshio.Mesh(x, [("triangle", surface_triangles(mesh.tets))]).write(file)

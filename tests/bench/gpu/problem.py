@@ -93,7 +93,7 @@ def _object(problem: Problem, beam: int) -> str:
         stiffness = f"[{', '.join(parts)}]"
     return f"""[[object]]
 name = "beam{beam}"
-mesh = {{ bar = [{cells}], size = [1, 1, 4] }}
+mesh = {{ bar = [{cells}], size = [1, 1, 4], split = "kuhn" }}
 density = 1000
 [object.effects]
 {problem.law} = {{ young = {stiffness}, poisson = 0.45 }}

@@ -103,7 +103,7 @@ class Beam:
             effects["touch"] = {"max_force": 1.1 * share * load.twist, "max_total_force": 5 * share * load.twist}
         beam = {
             "name": "beam",
-            "mesh": {"bar": list(self.cells), "size": [1, 1, LENGTH]},
+            "mesh": {"bar": list(self.cells), "size": [1, 1, LENGTH], "split": "kuhn"},
             "density": DENSITY,
             "effects": effects,
         }

@@ -38,7 +38,11 @@ def _object(index: int) -> dict[str, Any]:
     if is_wild(index):
         effects["touch"] = {"max_force": 1e9, "max_total_force": 1e9}
     cells = SIZES[index % len(SIZES)]
-    return {"name": f"beam{index}", "mesh": {"bar": list(cells), "size": [LENGTH, 1, 1]}, "effects": effects}
+    return {
+        "name": f"beam{index}",
+        "mesh": {"bar": list(cells), "size": [LENGTH, 1, 1], "split": "kuhn"},
+        "effects": effects,
+    }
 
 
 @dataclass

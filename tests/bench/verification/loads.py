@@ -26,15 +26,20 @@ def statics(
 ) -> Simulation:  # fmt: skip
     """A body without inertia, each step to 1e-8 of its first residual, with exact tangents. slender: one that bends far
     without much strain, with full steps; else with a line search."""
-    preconditioner, newton = ("cholesky", NEWTON) if slender else ("block_jacobi", NEWTON | {"trials": 8})
     with tempfile.TemporaryDirectory() as folder:
         mesh = mesh_file(Path(folder), rest, tets)
         o = bar(mesh=mesh, young=None, fixed=fixed, touch={"max_force": 1e30})
         o["effects"] |= law
-        return simulation(
-            o, gravity=gravity, integrator=newton, dt=1.0, update="every-1", preconditioner=preconditioner,
-            factor_precision="float64", tolerance=1e-9, max_iterations=3000, projection="none",
-        )  # fmt: skip
+        return static_scene(o, gravity, slender)
+
+
+def static_scene(table: dict[str, Any], gravity: Any = None, slender: bool = True) -> Simulation:
+    """The same of the table of an object."""
+    preconditioner, newton = ("cholesky", NEWTON) if slender else ("block_jacobi", NEWTON | {"trials": 8})
+    return simulation(
+        table, gravity=gravity, integrator=newton, dt=1.0, update="every-1", preconditioner=preconditioner,
+        factor_precision="float64", tolerance=1e-9, max_iterations=3000, projection="none",
+    )  # fmt: skip
 
 
 def push(sim: Simulation, groups: Sequence[Group]) -> None:

@@ -43,7 +43,7 @@ def elastica(load: float, weight: bool) -> tuple[float, float]:
 def bent(load: float, parts: int, cells: int, weight: bool) -> Reals:
     """w / L and u / L at the tip of a cantilever: P L^2 / EI = load at the tip, or q L^3 / EI = load along it."""
     width, young = 1.5, 1e6
-    mesh = bar_mesh((int(SLENDER) * cells, cells, 2), (SLENDER, 1.0, width))
+    mesh = bar_mesh((int(SLENDER) * cells, cells, 2), (SLENDER, 1.0, width), "kuhn")
     stiffness = young * width / 12  # E I, height 1
     gravity = (0.0, -load * stiffness / SLENDER**3 / (1000 * width), 0.0) if weight else None
     sim = statics(mesh.rest, mesh.tets, BEAM, "X < 1e-6", gravity)
@@ -72,7 +72,7 @@ def beams(meshes: list[int]) -> tuple[list[Row], Curves]:
 def cook(cells: int) -> float:
     """Deflection of (48, 52) in Cook's membrane: (0, 0), (48, 44), (48, 60), (0, 44), sheared at the right by 1."""
     thickness = 48 / cells
-    mesh = bar_mesh((cells, cells, 1), (1.0, 1.0, 1.0))
+    mesh = bar_mesh((cells, cells, 1), (1.0, 1.0, 1.0), "kuhn")
     X, Y, Z = mesh.rest.T
     rest = np.column_stack([48 * X, 44 * X + Y * (44 - 28 * X), thickness * Z])
     small = 1e-6 * thickness
@@ -152,7 +152,7 @@ def load(P: Callable[[Reals], Reals], X: Reals, step: float = 1e-3) -> Reals:
 
 def error_of(law: str, P: Callable[[Reals], Reals], cells: int) -> tuple[float, float]:
     """In L2 and in the H1 seminorm, relative."""
-    mesh = bar_mesh((cells,) * 3, (1.0, 1.0, 1.0))
+    mesh = bar_mesh((cells,) * 3, (1.0, 1.0, 1.0), "kuhn")
     hold = " or ".join(f"{a} < 1e-6 or {a} > 0.999999" for a in "XYZ")
     sim = statics(mesh.rest, mesh.tets, {law: {"young": 1.0, "poisson": 0.3}}, hold, slender=False)
     corners = mesh.rest[mesh.tets]

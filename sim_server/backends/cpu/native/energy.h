@@ -16,6 +16,7 @@ static Sums sums_of(const Loop& loop, const Body& body, bool keeps = false) {
         const double *x = loop.x + 3 * i, *v = loop.v + 3 * i, *from = e.before + 3 * i;
         const double step[3] = {x[0] - from[0], x[1] - from[1], x[2] - from[2]};
         add_node(s, e.mass[i], x, v, step, e.gravity);
+        if (e.load) s.work += dot3(e.load + 3 * i, step);
         if (!e.force) continue;
         double *force = e.force + 3 * i, *anchor = e.anchor + 3 * i, &spring = e.spring[i];
         if (spring == 0 && force[0] == 0 && force[1] == 0 && force[2] == 0) continue;
