@@ -3,6 +3,7 @@
 #define WIDE
 #include "hyperelastic.cuh"
 #include "hyperelastic_element.cuh"
+#include LAW
 
 struct HyperelasticElements {
     int n;                               // elements
@@ -35,7 +36,7 @@ KERNEL(elements, HyperelasticElements) {
 
     local_vec3 impulse[4];
     forces<HAS>(w, q, left, t, -p.h * volume, impulse);
-    put_element(p, i, t, q, w, left, k, floor, v, impulse);
+    put_element<HAS, REFUSES>(p, i, t, q, w, left, k, floor, v, impulse);
 }
 
 struct HyperelasticForces {
@@ -62,7 +63,7 @@ KERNEL(forces, HyperelasticForces) {
     Invariants<local_number> q = invariants<HAS>(left, t.J);
     local_vec3 impulse[4];
     forces<HAS>(slopes(c, q, floor), q, left, t, -p.h * at_items(p.volume, i), impulse);
-    put_impulses(p, i, t.J, floor, impulse);
+    put_impulses<REFUSES>(p, i, t.J, floor, impulse);
 }
 
 struct HyperelasticEnergy {

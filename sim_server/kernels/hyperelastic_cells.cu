@@ -4,6 +4,7 @@
 // (hyperelastic_patches.cu), all as in hyperelastic.cu, of W_s + U' J.
 #define WIDE
 #include "hyperelastic_element.cuh"
+#include LAW
 
 struct HyperelasticVolumes {
     int n;                   // cells: the elements, before their patches
@@ -47,7 +48,7 @@ struct HyperelasticPatchElements {
 };
 
 KERNEL(elements, HyperelasticPatchElements) {
-    index tet[4], patch = at_items(p.patch, i);
+    index tet[4], patch = at(p.patch, i);
     local_vec3 v[3];
     Tetrahedron<local_number> t = element_at(p, i, tet);
     field_edges(p.v, tet, v);
@@ -66,7 +67,7 @@ KERNEL(elements, HyperelasticPatchElements) {
         put_row(p.areas + 3 * (long long)p.n * a, i, p.n, {area.x, area.y, area.z});
         impulse[a] = impulse[a] + damping * t.area[a];
     }
-    put_element(p, i, t, q, w, left, k, floor, v, impulse);
+    put_element<HAS, REFUSES>(p, i, t, q, w, left, k, floor, v, impulse);
 }
 
 struct HyperelasticPatchForces {
@@ -87,7 +88,7 @@ struct HyperelasticPatchForces {
 
 // The forces of `elements` alone, without a tangent.
 KERNEL(forces, HyperelasticPatchForces) {
-    index tet[4], patch = at_items(p.patch, i);
+    index tet[4], patch = at(p.patch, i);
     Tetrahedron<local_number> t = element_at(p, i, tet);
     local_number c[CONSTANTS], floor = at_items(p.floor, i);
     constants_at(p, i, c);
@@ -97,7 +98,7 @@ KERNEL(forces, HyperelasticPatchForces) {
     w.wJ += row_at<2>(p.pressure, patch, 0);
     local_vec3 impulse[4];
     forces<HAS>(w, q, left, t, -p.h * at_items(p.volume, i), impulse);
-    put_impulses(p, i, t.J, floor, impulse);
+    put_impulses<REFUSES>(p, i, t.J, floor, impulse);
 }
 
 struct HyperelasticPatchEnergy {

@@ -1,12 +1,11 @@
 // SPDX-License-Identifier: MIT
-// What a tetrahedron of a law W(I1, I2, J) stores once the slopes of W and its impulses are known; LAW is the text of the law.
+// What a tetrahedron of a law W(I1, I2, J) stores once the slopes of W and its impulses are known. HAS, REFUSES: of the law's text.
 #pragma once
 #include "hyperelastic.cuh"
 #include "invariants.cuh"
-#include LAW
 
 // k: factor of the tangent times the volume; v: edges of the field that the tangent is applied to; impulse: h f_a, without K v.
-template <class P, class T>
+template <unsigned HAS, bool REFUSES, class P, class T>
 INLINE void put_element(const P& p, index i, const Tetrahedron<T>& t, const Invariants<T>& q, const Slopes<T>& w, const mat<T>& left,
                         T k, T floor, const vec<T> (&v)[3], vec<T> (&impulse)[4]) {
     Blocks6<T> B;
@@ -27,7 +26,7 @@ INLINE void put_element(const P& p, index i, const Tetrahedron<T>& t, const Inva
 }
 
 // The impulses alone.
-template <class P, class T> INLINE void put_impulses(const P& p, index i, T J, T floor, vec<T> (&impulse)[4]) {
+template <bool REFUSES, class P, class T> INLINE void put_impulses(const P& p, index i, T J, T floor, vec<T> (&impulse)[4]) {
     if constexpr (REFUSES) {
         auto here = J <= 0 && floor == 0;
         Blocks6<T> none = {};

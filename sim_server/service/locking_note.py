@@ -7,7 +7,7 @@ import numpy as np
 
 from sim_server.mechanics.world import Body
 from sim_server.scene import SceneObject
-from sim_server.scene.elements import element_errors
+from sim_server.scene.elements import PATCHED, element_errors
 from sim_server.simulation import Simulation
 
 LOCKS = 0.45  # Poisson's ratio above which a note is due, to two digits: laws may have it from other constants
@@ -51,8 +51,8 @@ def _nearly_incompressible(simulation: Simulation) -> dict[int, float]:
     found: dict[int, float] = {}
     for effect in simulation.effects.values():
         for body, (_, poisson) in effect.elastic.items():
-            linear = effect.name != "corotational" or simulation.world.bodies[body].elements == "linear"
-            if linear and round(float(poisson.max()), 2) > LOCKS:
+            others = effect.name in ("corotational", *PATCHED) and simulation.world.bodies[body].elements != "linear"
+            if not others and round(float(poisson.max()), 2) > LOCKS:
                 found[body] = max(found.get(body, 0.0), float(poisson.max()))
     return found
 
