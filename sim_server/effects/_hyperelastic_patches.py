@@ -15,10 +15,9 @@ each patch ::
 
     K_ab = sum_e K_ab(W_s + U'(J_p) J) + sum_p V_p U''(J_p) g_p,a g_p,b^T,   g_p,a = sum_e V cof(F) D_a / V_p
 
-Each element is made positive semi-definite by itself, as linear elements are, and U'' is not below 0 unless
-`[solver] projection` is "none": a pressure that a patch as a whole would bear may so make its elements a little stiffer.
-In a patch with several constants, b is their mean by volume. Where U is not defined, J_p <= 0, some element is
-refused.
+Unless `[solver] projection` is "none", each element is made positive semi-definite by itself, as linear elements are,
+and U'' is not below 0: a pressure that a patch as a whole would bear may so make the tangent a little stiffer. In a
+patch with several constants, b is their mean by volume. Where U is not defined, J_p <= 0, some element is refused.
 
 Source: as in _cells.py, and Pires, de Souza Neto and de la Cuesta Padilla, An assessment of the average nodal volume
 formulation for the analysis of nearly incompressible solids under finite strains, 2004.
@@ -76,7 +75,7 @@ class HyperelasticPatches(Hyperelastic):
         self._patch_of_corner = self._patches.owner
         self._members: Int32 = np.argsort(self.patch, kind="stable").astype(np.int32)
         self._member_start = np.searchsorted(self.patch[self._members], np.arange(before[-1] + 1)).astype(np.int32)
-        self.patch_volume: Float64 = np.bincount(self.patch, self.volume)
+        self.patch_volume: Float64 = np.bincount(self.patch, self.volume).astype(np.float64)
         floor = np.zeros(len(self.patch_volume))
         floor[self.patch] = self.floor  # one in a body
         self.patch_floor = floor
@@ -101,7 +100,8 @@ class HyperelasticPatches(Hyperelastic):
                 parts.append(constants)
             return np.concatenate(parts, axis=1)[:, self.order]
 
-        return self.world.follow(law.name, compute=compute)
+        constants: Float64 = self.world.follow(law.name, compute=compute)
+        return constants
 
     def _bulk_of_patches(self, scene: Scene) -> Float64:
         bulk = np.concatenate([bulk_of_patches(self.law, values) for values in self.values_in(scene, self.law)])

@@ -25,7 +25,14 @@ from typing import Annotated, Any
 
 from pydantic import AfterValidator, Field
 
-from sim_server.effects._hyperelastic import Hyperelastic, Law, hyperelastic, lame, young_and_poisson, young_and_poisson_of
+from sim_server.effects._hyperelastic import (
+    Hyperelastic,
+    Law,
+    hyperelastic,
+    lame,
+    young_and_poisson,
+    young_and_poisson_of,
+)
 from sim_server.mechanics.world import Body, World
 from sim_server.scene.parameters import complaint
 

@@ -6,6 +6,8 @@
 #include "invariants.cuh"
 #include LAW
 
+static_assert((HAS & W_JJ) != 0, "U is a function of J");
+
 struct PatchPressures {
     int n;                               // patches
     int projection;                      // of the tangent

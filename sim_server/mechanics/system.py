@@ -218,7 +218,10 @@ def _couplings(elements: Int32, world: World, n: int) -> tuple[Int64, Int32]:
 
 @dataclass(frozen=True)
 class _Places:
-    """What an effect couples. keys: of its blocks, row * nodes + column; stencil: of nodes and the keys of all blocks."""
+    """What an effect couples.
+
+    keys: of its blocks, row * nodes + column; stencil: makes its places from the number of nodes and the keys of all
+    """
 
     keys: list[Int64]
     stencil: Callable[[int, Int64], Stencil]
