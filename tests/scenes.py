@@ -20,7 +20,7 @@ from tests.reference.corotational import Solid
 def bar(cells: tuple[int, int, int] = (4, 2, 2), size: tuple[float, float, float] = (2, 1, 1), **table: Any) -> dict:
     """An [[object]]: a bar along x. young, poisson, rotation, tangent, fixed (an expression), damping (mass,
     stiffness), touch; other keys go into the table as they are."""
-    table.setdefault("name", "bar")
+    table = {"name": "bar", "elements": "linear", **table}
     effects: dict[str, Any] = {}
     if table.setdefault("young", 1e5) is not None:
         effects["corotational"] = {"young": table["young"], "poisson": table.pop("poisson", 0.3)}

@@ -29,6 +29,7 @@ BODY = """
 name = "{name}"
 mesh = {{ bar = [{a}, {a}, {b}], size = [1, 1, {length:.4f}] }}
 pose = {{ rotate = [0, {turn:.1f}, 0], translate = [{x:g}, 0, {z:g}] }}
+elements = "linear"
 density = {density:g}
 [object.effects]
 corotational = {{ young = {young:.4g}, poisson = {poisson:.3f} }}

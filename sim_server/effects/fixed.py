@@ -95,8 +95,11 @@ class Params(Parameters):
 
 def clamped_nodes(params: Params, rest: Float64) -> NDArray[np.bool_]:
     """Returns which nodes a group holds along all directions, (n,). rest (n, 3) [m]."""
-    none = np.zeros(len(rest), bool)
-    return np.any([none, *(where.mask(g.where, rest) for g in params.groups if g.along is None)], axis=0)
+    held = np.zeros(len(rest), bool)
+    for group in params.groups:
+        if group.along is None:
+            held |= where.mask(group.where, rest)
+    return held
 
 
 def build(world: World, listed: list[tuple[Body, Any]]) -> Effect:

@@ -46,7 +46,9 @@ def kind_of_elements(o: HasElements, mesh: Mesh, integrator: IntegratorOptions) 
     """Returns the kind that an object with this mesh has."""
     if o.elements != "auto":
         return o.elements
-    return "quadratic" if mesh.quadratic is not None and keeps_mid_nodes(o, integrator) else "linear"
+    if _reason(o.effects, integrator):
+        return "linear"
+    return "smoothed" if mesh.quadratic is None else "quadratic"
 
 
 def keeps_mid_nodes(o: HasElements, integrator: IntegratorOptions) -> bool:

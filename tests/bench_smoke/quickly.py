@@ -1,8 +1,11 @@
 # SPDX-License-Identifier: MIT
 """A benchmark at its small size, in a process of its own, and what each must write."""
 
+import contextlib
 import json
 import math
+import os
+import signal
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -15,15 +18,23 @@ UNKNOWN_IN = {  # of other steps; without a goal; of a step not ours; without po
     "accuracy": ("step error", "solve error"), "contact": ("goal ms", "loop ms"),
     "cpu": ("iterations", "residual", "wall"), "rosenbrock": ("energy", "estimate"),
 }  # fmt: skip
+TIME = float(os.environ.get("PYTEST_TIMEOUT", 120)) - 10  # s, less than the test may take
 WITHOUT_PICTURE = ("faults", "gallery")
 
 
 def bench(name: str, out: Path, *arguments: str) -> dict[str, Any]:
     """What `python -m tests.bench.NAME --quick` writes as JSON; its other files are in `out` too."""
     command = [sys.executable, "-m", f"tests.bench.{name}", "--quick", "--out", str(out), *arguments]
-    result = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=110)
-    assert result.returncode == 0, result.stdout + result.stderr
-    assert "FAILED" not in result.stdout
+    started = subprocess.Popen(
+        command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True
+    )
+    try:
+        printed, said = started.communicate(timeout=TIME)
+    finally:
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(started.pid, signal.SIGKILL)  # what it has started, too: it would slow whatever runs next
+    assert started.returncode == 0, printed + said
+    assert "FAILED" not in printed
     return json.loads((out / f"{name}.json").read_text())
 
 

@@ -104,8 +104,8 @@ def field(tab: Any, label: str) -> Any:
 
 def choose_colour(tab: Any, mode: str) -> None:
     """Has a tab colour its bodies so (clients.web.paint.MODES)."""
-    field(tab, "colour").click()
-    tab.get_by_role("option", name=mode, exact=True).click()
+    field(tab, "colour").click(force=True)
+    tab.get_by_role("option", name=mode, exact=True).click(force=True)
 
 
 def on_screen(tab: Any, view: View, point: Sequence[float] | NDArray) -> tuple[float, float]:

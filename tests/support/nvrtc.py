@@ -2,10 +2,17 @@
 """NVIDIA's run-time compiler by itself (package nvidia-cuda-nvrtc): it needs no GPU and no driver."""
 
 import ctypes
+import hashlib
+import json
+import os
+from functools import cache
 from importlib import metadata
 from pathlib import Path
 
-_made: dict[tuple[bytes, ...], tuple[bytes, str]] = {}  # by the text and the options; headers stay while tests run
+from sim_server.backends.compiler import cache_folder
+
+ROOT = Path(__file__).resolve().parents[2]
+HEADERS = ("sim_server", "precond_worker", "tests/backends")  # where a text may include from
 
 
 def library() -> ctypes.CDLL | None:
@@ -29,12 +36,38 @@ def arch(name: str, fast: str = "mid", whole: bool = True) -> list[str]:
 
 
 def compiled(nvrtc: ctypes.CDLL, source: Path, options: list[str]) -> tuple[bytes, str]:
-    """Machine code of a text (empty if it was refused), and what the compiler said. The same is compiled once."""
-    text, encoded = source.read_bytes(), [o.encode() for o in options]
-    key = (text, *encoded)
-    if key not in _made:
-        _made[key] = _compiled(nvrtc, source.name, text, encoded)
-    return _made[key]
+    """Machine code of a text (empty if it was refused), and what the compiler said.
+
+    The same is compiled once on a machine, whatever folder the checkout lies in; kept where kernels for the CPU are.
+    """
+    text = source.read_bytes()
+    words = [option.replace(str(ROOT), "") for option in options]
+    key = hashlib.sha256(b"\0".join([text, *(w.encode() for w in words), _surroundings()])).hexdigest()[:32]
+    return _read(key) or _kept(key, *_compiled(nvrtc, source.name, text, [o.encode() for o in options]))
+
+
+@cache
+def _surroundings() -> bytes:
+    """What else machine code depends on: the compiler and the headers, which stay while tests run."""
+    files = sorted(p for folder in HEADERS for p in (ROOT / folder).rglob("*") if p.suffix in (".h", ".cuh"))
+    return b"\0".join([metadata.version("nvidia-cuda-nvrtc").encode(), *(p.read_bytes() for p in files)])
+
+
+def _read(key: str) -> tuple[bytes, str] | None:
+    try:
+        said, _, code = (cache_folder() / "nvrtc" / key).read_bytes().partition(b"\n")
+    except OSError:
+        return None
+    return code, json.loads(said)
+
+
+def _kept(key: str, code: bytes, said: str) -> tuple[bytes, str]:
+    folder = cache_folder() / "nvrtc"
+    folder.mkdir(parents=True, exist_ok=True)
+    whole = folder / f"{key}.{os.getpid()}"
+    whole.write_bytes(json.dumps(said).encode() + b"\n" + code)
+    whole.replace(folder / key)
+    return code, said
 
 
 def _compiled(nvrtc: ctypes.CDLL, name: str, text: bytes, options: list[bytes]) -> tuple[bytes, str]:
