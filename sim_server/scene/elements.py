@@ -46,9 +46,8 @@ def kind_of_elements(o: HasElements, mesh: Mesh, integrator: IntegratorOptions) 
     """Returns the kind that an object with this mesh has."""
     if o.elements != "auto":
         return o.elements
-    if _reason(o.effects, integrator):
-        return "linear"
-    return "smoothed" if mesh.quadratic is None else "quadratic"
+    others: Kind = "smoothed" if mesh.quadratic is None else "quadratic"
+    return "linear" if _reason(others, o.effects, integrator) else others
 
 
 def keeps_mid_nodes(o: HasElements, integrator: IntegratorOptions) -> bool:
