@@ -11,6 +11,7 @@ DT = 0.01
 CUBE: dict[str, Any] = {
     "name": "cube",
     "mesh": {"bar": [3, 3, 3], "size": [0.3, 0.3, 0.3], "split": "kuhn"},
+    "elements": "linear",
     "pose": {"translate": [0, 0.02, 0]},
     "effects": {"corotational": {"young": 1e5, "poisson": 0.3}, "touch": True},
 }

@@ -8,6 +8,7 @@ import numpy as np
 from sim_server.mechanics.world import Body
 from sim_server.scene import SceneObject
 from sim_server.scene.elements import PATCHED, element_errors
+from sim_server.scene.integrator_options import IntegratorOptions
 from sim_server.simulation import Simulation
 
 LOCKS = 0.45  # Poisson's ratio above which a note is due, to two digits: laws may have it from other constants
@@ -28,7 +29,7 @@ def locking_notes(simulation: Simulation) -> Iterator[tuple[list[Body], str]]:
     for body, poisson in sorted(_nearly_incompressible(simulation).items()):
         b = simulation.world.bodies[body]
         mesh: str = objects[b.name].mesh.split or "unstructured"
-        alike.setdefault((mesh, poisson, _remedy(objects[b.name], simulation)), []).append(b)
+        alike.setdefault((mesh, poisson, _remedy(objects[b.name], simulation.scene.integrator)), []).append(b)
     for (mesh, poisson, remedy), bodies in alike.items():
         of = "an unstructured mesh" if mesh == "unstructured" else f'split = "{mesh}"'
         lost = f"{100 * (1 - kept(mesh, poisson)):.0f} %"
@@ -57,8 +58,9 @@ def _nearly_incompressible(simulation: Simulation) -> dict[int, float]:
     return found
 
 
-def _remedy(o: SceneObject, simulation: Simulation) -> str:
-    patches = not list(element_errors([o.model_copy(update={"elements": "patch"})], simulation.scene.integrator))
-    ways = ['elements = "patch" does not lock'] if patches else []
+def _remedy(o: SceneObject, integrator: IntegratorOptions) -> str:
+    kinds = ("smoothed", "patch")
+    others = [k for k in kinds if not list(element_errors([o.model_copy(update={"elements": k})], integrator))]
+    ways = [f'elements = "{kind}" does not lock' for kind in others[:1]]
     ways += ['split = "mirrored" locks less'] if o.mesh.split == "kuhn" else []
     return ", ".join(ways) or "a finer mesh locks less"

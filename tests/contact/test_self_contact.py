@@ -31,7 +31,7 @@ def body(mesh: dict, name: str = "body", young: float = 3e5, fixed: str | None =
         effects["fixed"] = {"where": fixed}
     if damping := table.pop("damping", None):
         effects["rayleigh"] = {"mass": damping[0], "stiffness": damping[1]}
-    return {"name": name, "mesh": mesh, "effects": effects, **table}
+    return {"name": name, "mesh": mesh, "elements": "linear", "effects": effects, **table}
 
 
 def made(

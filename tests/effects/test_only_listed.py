@@ -27,7 +27,9 @@ print(json.dumps({
 }))
 """
 
-OBJECT = '[[object]]\nname = "block"\nmesh = { bar = [2, 2, 2], size = [1, 1, 1] }\n[object.effects]\n'
+OBJECT = (
+    '[[object]]\nname = "block"\nmesh = { bar = [2, 2, 2], size = [1, 1, 1] }\nelements = "linear"\n[object.effects]\n'
+)
 COROTATIONAL = "corotational = { young = 1e5, poisson = 0.3 }\n"
 
 SHARED = ["shape_matching", "gather_forces", "gather_blocks"]  # texts that only some effects need

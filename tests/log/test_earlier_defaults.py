@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Logs and checkpoints of versions with other defaults mean what they meant: the split of a bar was "kuhn"."""
+"""Logs and checkpoints of earlier versions mean what they meant: a bar was split as "kuhn", elements were linear."""
 
 import copy
 import json
@@ -15,6 +15,7 @@ from sim_server.replay.log import Recording
 from sim_server.replay.run import Replay
 from sim_server.scene import earlier_defaults
 from sim_server.scene.model import Scene
+from sim_server.simulation import Simulation
 from tests.system.link_helpers import free_endpoint
 from tests.system.server_process import run
 
@@ -32,7 +33,7 @@ def earlier() -> dict[str, Any]:
         ],
     }  # fmt: skip
     resolved = Scene.model_validate(table).resolved()
-    del resolved["object"][1]["mesh"]["split"]
+    del resolved["object"][1]["mesh"]["split"], resolved["object"][1]["elements"]
     return resolved
 
 
@@ -48,6 +49,16 @@ def test_a_scene_of_an_earlier_version_has_the_split_of_its_default() -> None:
     np.testing.assert_array_equal(said, bar(CELLS, SIZE, "mirrored").tets)
     np.testing.assert_array_equal(unsaid, bar(CELLS, SIZE, "kuhn").tets)
     np.testing.assert_array_equal(meshes(table)[1], said)  # a scene file of today, without the key
+
+
+def test_a_scene_of_an_earlier_version_has_linear_elements() -> None:
+    def kinds(table: dict[str, Any]) -> list[str]:
+        return [body.elements for body in Simulation(Scene.model_validate(table)).world.bodies]
+
+    assert kinds(earlier()) == ["smoothed", "smoothed"] and kinds(earlier_defaults.named(earlier())) == [
+        "smoothed",
+        "linear",
+    ]
 
 
 def test_a_resolved_scene_names_the_split_of_every_bar() -> None:

@@ -27,7 +27,12 @@ def quadratic_bar(folder: Path, curved: float = 0.05, **table) -> Simulation:
     solver = {k: table.pop(k) for k in ("dt", "warp", "gravity", "integrator", "preconditioner") if k in table}
     mesh = jittered((4, 2, 2), curved=curved)
     meshio.write(folder / "q.vtu", meshio.Mesh(mesh.rest, [("tetra10", mesh.quadratic)]))
-    given = {"young": REGIONS, "poisson": 0.45, "mesh": {"file": str(folder / "q.vtu"), "scale": 0.5}} | table
+    given = {
+        "elements": "auto",
+        "young": REGIONS,
+        "poisson": 0.45,
+        "mesh": {"file": str(folder / "q.vtu"), "scale": 0.5},
+    } | table
     return simulation(bar(**given), **solver)
 
 

@@ -26,7 +26,7 @@ def test_objects_alike_have_one_line():
     bodies = [bar(name=f"b{k}", mesh=KUHN, poisson=0.49) for k in range(5)]
     assert noted(bar(name="soft", mesh=KUHN, poisson=0.45), *bodies) == [
         "objects 'b0', 'b1', 'b2' and 2 more with a Poisson's ratio of 0.49 and linear tetrahedra (split = \"kuhn\"), "
-        'which lock: a beam five of them thick bends about 60 % too little; elements = "patch" does not lock, '
+        'which lock: a beam five of them thick bends about 60 % too little; elements = "smoothed" does not lock, '
         'split = "mirrored" locks less'
     ]
 

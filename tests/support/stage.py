@@ -28,6 +28,7 @@ preconditioner = "cholesky"
 [[object]]
 name = "beam"
 mesh = {{ bar = [4, 4, 12], size = [1, 1, 4], split = "kuhn" }}
+elements = "linear"
 [object.effects]
 corotational = {{ young = 1e6, poisson = 0.4 }}
 fixed = {{ where = "Z < 0.01" }}

@@ -94,6 +94,7 @@ def _object(problem: Problem, beam: int) -> str:
     return f"""[[object]]
 name = "beam{beam}"
 mesh = {{ bar = [{cells}], size = [1, 1, 4], split = "kuhn" }}
+elements = "linear"
 density = 1000
 [object.effects]
 {problem.law} = {{ young = {stiffness}, poisson = 0.45 }}

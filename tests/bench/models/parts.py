@@ -79,6 +79,7 @@ def model(name: str, tets: int, device: str = "cpu", precision: str = "float64",
     beam = {
         "name": "beam",
         "mesh": {"bar": list(BARS[tets]), "size": [1.0, 1.0, 4.0], "split": "kuhn"},
+        "elements": "linear",
         "effects": {key: table, **BESIDE.get(key, {})},
     }
     solver = {"preconditioner": "none", "precision": precision, **solver}

@@ -104,6 +104,7 @@ class Beam:
         beam = {
             "name": "beam",
             "mesh": {"bar": list(self.cells), "size": [1, 1, LENGTH], "split": "kuhn"},
+            "elements": "linear",
             "density": DENSITY,
             "effects": effects,
         }

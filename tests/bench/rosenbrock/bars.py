@@ -61,7 +61,7 @@ class Bar:
         return {
             "name": "rosenbrock", "dt": dt, "effects": {"gravity": {}} if self.gravity else {},
             "integrator": method.integrator, "solver": solver | method.solver,
-            "object": [{"name": "bar", "mesh": mesh, "effects": effects}],
+            "object": [{"name": "bar", "mesh": mesh, "elements": "linear", "effects": effects}],
         }  # fmt: skip
 
     def _law(self) -> dict[str, Any]:

@@ -51,6 +51,7 @@ preconditioner = "cholesky"
 BEAM = """[[object]]
 name = "beam{number}"
 mesh = {{ bar = [3, 3, 10], size = [1, 1, 4], split = "kuhn" }}
+elements = "linear"
 pose = {{ translate = [{x}, 0, {z}] }}
 [object.effects]
 corotational = {{ young = {young:.0f}, poisson = 0.3 }}

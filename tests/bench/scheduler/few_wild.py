@@ -41,6 +41,7 @@ def _object(index: int) -> dict[str, Any]:
     return {
         "name": f"beam{index}",
         "mesh": {"bar": list(cells), "size": [LENGTH, 1, 1], "split": "kuhn"},
+        "elements": "linear",
         "effects": effects,
     }
 
