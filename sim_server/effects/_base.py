@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 from sim_server.arrays import Float64, Int32
 from sim_server.backends.base import Launch, PendingUpdate
 from sim_server.backends.energies import ElementEnergies
-from sim_server.mechanics.clusters import PatchedCells
-from sim_server.mechanics.system import Stencil, System
+from sim_server.mechanics.system import Coupled, Stencil, System
 from sim_server.mechanics.world import Body, World
 from sim_server.scene import Scene
 
@@ -61,7 +60,7 @@ class Effect:
     elastic: Mapping[int, tuple[Float64, Float64]] = MappingProxyType({})
 
     @property
-    def coupled(self) -> Int32 | PatchedCells | None:
+    def coupled(self) -> Coupled | None:
         """What the system is to have places for (`stencil` of the launches)."""
         return self.elements
 

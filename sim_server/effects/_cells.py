@@ -53,6 +53,7 @@ from sim_server.scene.regions import region_numbers
 
 Constants = tuple[Float64, Float64]
 TEXT, PATCHES, SUMS = (f"effects/corotational_{name}.cu" for name in ("cells", "patches", "cell_sums"))
+BLOCKS = "kernels/patch_blocks.cu"
 
 
 @dataclass(frozen=True)
@@ -176,7 +177,7 @@ class StrainCellElements(Effect):
             owners=stencil.corner_owners, nodal_impulse=self.nodal_impulse, scaled_gradients=self.scaled_gradients,
             quaternion=self.quaternion, b=system.b, block=system.block, mean=system.mean, **twist,
         )  # fmt: skip
-        own = w.backend.module(PATCHES).bind(
+        own = w.backend.module(BLOCKS).bind(
             "own_blocks", w.nodes, start=patches.corner_start, corners=patches.corners,
             patch_gradients=self.patch_gradients, block=system.block,
         )  # fmt: skip
@@ -186,7 +187,7 @@ class StrainCellElements(Effect):
             start=stencil.pair_start, pairs=stencil.pairs, scaled_gradients=self.scaled_gradients, sums=system.sums,
             **owners,
         )  # fmt: skip
-        of_patches = w.backend.module(PATCHES).bind(
+        of_patches = w.backend.module(BLOCKS).bind(
             "blocks", len(system.sums), start=patches.pair_start, pairs=patches.pairs,
             patch_gradients=self.patch_gradients, sums=system.sums,
         )  # fmt: skip

@@ -92,6 +92,13 @@ INVERSION: dict[str, Any] = {
 }
 
 
+class InPatches(Regional):
+    """Constants of a law whose elements may be patches."""
+
+    def variant_of(self, elements: str) -> str:
+        return "_patches" if elements == "patch" else self.variant
+
+
 @dataclass(frozen=True)
 class Law:
     """A law: the name of its effect, its constants, and their form in the kernels.
@@ -99,7 +106,8 @@ class Law:
     pack: values of the constants, (m,) each -> (k, m) in the order of the kernel text. elastic: the Young's modulus
     [Pa] and Poisson's ratio that it has at small strains. axes: (m, 3, 3) material axes in columns, or None. text:
     path of the kernel text. refuses: J <= 0 is not defined. regularizes: the text takes a floor of J, and where the
-    law refuses the scene may ask for it.
+    law refuses the scene may ask for it. volumetric: which of the packed constants is the factor of a function of J
+    alone, of which patches take their part (_hyperelastic_patches.py); None: the law has linear elements alone.
     """
 
     name: str
@@ -110,6 +118,7 @@ class Law:
     text: str = ""
     refuses: bool = True
     regularizes: bool = True
+    volumetric: int | None = None
 
     @property
     def path(self) -> str:
@@ -126,7 +135,8 @@ class Law:
             given = {} if first else {"default": c.default}
             fields[c.name] = (Annotated[kind, c.live], Field(description=c.text, **given))
         extra = INVERSION if self.refuses and self.regularizes else {}
-        return create_model(f"Params of {self.name}", __base__=Regional, **fields, **extra)
+        base = Regional if self.volumetric is None else InPatches
+        return create_model(f"Params of {self.name}", __base__=base, **fields, **extra)
 
 
 def constants_of(law: Law, body: Body, params: Any) -> Values:
@@ -270,6 +280,15 @@ class Hyperelastic(Tetrahedra):
             Refusal(self.law.name, int(self.owner[e]), int(self.number[e]), float(found[e, 0]), float(found[e, 1]))
             for e in here
         ]
+
+
+def hyperelastic(law: Law, world: World, listed: list[tuple[Body, Any]]) -> Hyperelastic:
+    """The elements of bodies that list a law of which patches may have a part, all of one kind. Raises InputError."""
+    if listed[0][0].elements == "linear":
+        return Hyperelastic(world, listed, law)
+    from sim_server.effects._hyperelastic_patches import HyperelasticPatches  # linear elements need none of it
+
+    return HyperelasticPatches(world, listed, law)
 
 
 def young_and_poisson_of(poisson: Any = Poisson) -> tuple[Constant, Constant]:

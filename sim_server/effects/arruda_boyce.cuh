@@ -42,3 +42,6 @@ template <class T> INLINE Slopes<T> slopes(const T (&c)[CONSTANTS], const Invari
     }
     return w;
 }
+
+// What patches take from it (elements = "patch"): U = bulk/2 ln^2 J
+template <class T> INLINE Jet<T> volumetric(T bulk, T J, T floor) { return half_squared_logarithm(bulk, J, floor); }

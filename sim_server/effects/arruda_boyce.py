@@ -25,7 +25,7 @@ from typing import Annotated, Any
 from pydantic import Field
 
 from sim_server.arrays import Float64
-from sim_server.effects._hyperelastic import Constant, Hyperelastic, Law, Values, of_shear_and_bulk
+from sim_server.effects._hyperelastic import Constant, Hyperelastic, Law, Values, hyperelastic, of_shear_and_bulk
 from sim_server.mechanics.world import Body, World
 from sim_server.scene.live import Live
 from sim_server.scene.parameters import Positive
@@ -50,10 +50,11 @@ LAW = Law(
     ),
     pack=lambda values: [values["shear"], values["segments"], values["bulk"]],
     elastic=small_strains,
+    volumetric=2,
 )
 Params = LAW.parameters()
 
 
 def build(world: World, listed: list[tuple[Body, Any]]) -> Hyperelastic:
     """The elements; raises InputError for an element in no region of shear."""
-    return Hyperelastic(world, listed, LAW)
+    return hyperelastic(LAW, world, listed)

@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: MIT
-// Patches of corotational strain cells (formulas: _cells.py): the mean dilatation, the gradients of what they add to the tangent,
-// one block per pair of their nodes, and their energies. All are gathers: no two items write to the same place.
+// Patches of corotational strain cells (formulas: _cells.py): the mean dilatation, the gradients of what they add to the tangent
+// (kernels/patch_blocks.cu), and their energies. All are gathers: no two items write to the same place.
 #include "coalesced_io.cuh"
 
 struct PatchMeans {
@@ -32,7 +32,7 @@ struct PatchGradients {
     const int* cells;               // (start[n],) the cells
     const local* scaled_gradients;  // (slots, 4) sqrt(h (c + beta) mu V) R G_a of the cells
     const local* share;             // (cells,) sqrt(kappa V / (mu V_p)) [-]
-    local* patch_gradients;         // (n, 4) out: sqrt(h (c + beta) kappa V_p) g_p,a, and 0
+    local* patch_gradients;         // (n, 4) out: sqrt(h (c + beta) kappa V_p) g_p,a, and 1
 };
 
 INLINE void gradients_add(const PatchGradients& p, int, int k, local* sum) {
@@ -44,53 +44,10 @@ INLINE void gradients_add(const PatchGradients& p, int, int k, local* sum) {
 
 INLINE void gradients_put(const PatchGradients& p, int i, const local* sum) {
     for (int m = 0; m < 3; ++m) p.patch_gradients[4 * i + m] = sum[m];
-    p.patch_gradients[4 * i + 3] = 0;
+    p.patch_gradients[4 * i + 3] = 1;
 }
 
 SUM_KERNEL(gradients, PatchGradients, 3)
-
-struct PatchNodes {
-    int n;                         // nodes
-    const int* start;              // (n + 1,) into corners
-    const int* corners;            // (start[n],) corners of patches at the node
-    const local* patch_gradients;  // (corners, 4)
-    own<local> block;              // (n, 6) in, out: upper triangle of the node's own block of A, world frame [kg]
-};
-
-INLINE void own_blocks_add(const PatchNodes& p, int, int k, local* sum) {
-    local g[4];
-    get_row(p.patch_gradients, p.corners[k], g);
-    sum[0] += g[0] * g[0]; sum[1] += g[0] * g[1]; sum[2] += g[0] * g[2];
-    sum[3] += g[1] * g[1]; sum[4] += g[1] * g[2]; sum[5] += g[2] * g[2];
-}
-
-INLINE void own_blocks_put(const PatchNodes& p, int i, const local* sum) {
-    for (int m = 0; m < 6; ++m) row_put<6>(p.block, i, m, row_at<6>(p.block, i, m) + sum[m]);
-}
-
-SUM_KERNEL(own_blocks, PatchNodes, 6)
-
-struct PatchBlocks {
-    int n;                         // blocks above the diagonal
-    const int* start;              // (n + 1,) into pairs
-    const int* pairs;              // (start[n], 2) corners of patches at the block's row and column
-    const local* patch_gradients;  // (corners, 4)
-    own<local> sums;               // (n, 9) in, out, world frame, row major [kg]
-};
-
-INLINE void blocks_add(const PatchBlocks& p, int, int k, local* s) {
-    local a[4], b[4];
-    get_row(p.patch_gradients, p.pairs[2 * k], a);
-    get_row(p.patch_gradients, p.pairs[2 * k + 1], b);
-    for (int r = 0; r < 3; ++r)
-        for (int c = 0; c < 3; ++c) s[3 * r + c] += a[r] * b[c];
-}
-
-INLINE void blocks_put(const PatchBlocks& p, int i, const local* sum) {
-    for (int m = 0; m < 9; ++m) row_put<9>(p.sums, i, m, row_at<9>(p.sums, i, m) + sum[m]);
-}
-
-SUM_KERNEL(blocks, PatchBlocks, 9)
 
 struct PatchEnergy {
     int n;                    // patches

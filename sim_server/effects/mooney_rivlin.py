@@ -20,7 +20,7 @@ IV, 1948; with the isochoric invariants of Holzapfel, Nonlinear Solid Mechanics,
 
 from typing import Any
 
-from sim_server.effects._hyperelastic import Constant, Hyperelastic, Law, of_shear_and_bulk
+from sim_server.effects._hyperelastic import Constant, Hyperelastic, Law, hyperelastic, of_shear_and_bulk
 from sim_server.mechanics.world import Body, World
 from sim_server.scene.parameters import NotNegative, Positive
 
@@ -34,10 +34,11 @@ LAW = Law(
     ),
     pack=lambda values: [values["c1"], values["c2"], values["bulk"]],
     elastic=lambda values: of_shear_and_bulk(2 * (values["c1"] + values["c2"]), values["bulk"]),
+    volumetric=2,
 )
 Params = LAW.parameters()
 
 
 def build(world: World, listed: list[tuple[Body, Any]]) -> Hyperelastic:
     """The elements; raises InputError for an element in no region of c1."""
-    return Hyperelastic(world, listed, LAW)
+    return hyperelastic(LAW, world, listed)

@@ -18,3 +18,6 @@ template <class T> INLINE Slopes<T> slopes(const T (&c)[CONSTANTS], const Invari
     w.wJJ = s * L.dd + c[0] * L.d * L.d;
     return w;
 }
+
+// What patches take from it (elements = "patch"): U = bulk/2 ln^2 J, bulk = lambda
+template <class T> INLINE Jet<T> volumetric(T bulk, T J, T floor) { return half_squared_logarithm(bulk, J, floor); }

@@ -25,7 +25,14 @@ from typing import Annotated, Any
 
 from pydantic import AfterValidator, Field
 
-from sim_server.effects._hyperelastic import Hyperelastic, Law, lame, young_and_poisson, young_and_poisson_of
+from sim_server.effects._hyperelastic import (
+    Hyperelastic,
+    Law,
+    hyperelastic,
+    lame,
+    young_and_poisson,
+    young_and_poisson_of,
+)
 from sim_server.mechanics.world import Body, World
 from sim_server.scene.parameters import complaint
 
@@ -46,10 +53,11 @@ LAW = Law(
     young_and_poisson_of(Annotated[float, Field(lt=0.5), AfterValidator(_not_auxetic)]),
     pack=lame,
     elastic=young_and_poisson,
+    volumetric=0,
 )
 Params = LAW.parameters()
 
 
 def build(world: World, listed: list[tuple[Body, Any]]) -> Hyperelastic:
     """The elements; raises InputError for an element in no region of young."""
-    return Hyperelastic(world, listed, LAW)
+    return hyperelastic(LAW, world, listed)

@@ -18,3 +18,9 @@ template <class T> INLINE Slopes<T> slopes(const T (&c)[CONSTANTS], const Invari
     w.wJJ = c[0];
     return w;
 }
+
+// What patches take from it (elements = "patch"): U = bulk/2 (J - 1)^2, bulk = lambda
+template <class T> INLINE Jet<T> volumetric(T bulk, T J, T) {
+    T d = bulk * (J - 1);
+    return {(entry<T>)0.5 * d * (J - 1), d, bulk};
+}

@@ -34,6 +34,7 @@ from sim_server.effects._hyperelastic import (
     Hyperelastic,
     Law,
     Values,
+    hyperelastic,
     lame,
     young_and_poisson,
     young_and_poisson_of,
@@ -56,10 +57,11 @@ LAW = Law(
     pack=pack,
     elastic=young_and_poisson,
     refuses=False,
+    volumetric=0,
 )
 Params = LAW.parameters()
 
 
 def build(world: World, listed: list[tuple[Body, Any]]) -> Hyperelastic:
     """The elements; raises InputError for an element in no region of young."""
-    return Hyperelastic(world, listed, LAW)
+    return hyperelastic(LAW, world, listed)

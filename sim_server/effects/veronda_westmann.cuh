@@ -24,3 +24,6 @@ template <class T> INLINE Slopes<T> slopes(const T (&c)[CONSTANTS], const Invari
     w.wJJ = e * (A.dd * q.I1 + c[1] * dI * dI) + s * B.dd * q.I2 + c[2] * (L.d * L.d + L.f * L.dd);
     return w;
 }
+
+// What patches take from it (elements = "patch"): U = bulk/2 ln^2 J
+template <class T> INLINE Jet<T> volumetric(T bulk, T J, T floor) { return half_squared_logarithm(bulk, J, floor); }

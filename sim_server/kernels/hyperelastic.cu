@@ -2,7 +2,7 @@
 // Tetrahedra of a law W(I1, I2, J), by MJED (formulas: sim_server/effects/_hyperelastic.py). LAW is its text, effects/<law>.cuh.
 #define WIDE
 #include "hyperelastic.cuh"
-#include "invariants.cuh"
+#include "hyperelastic_element.cuh"
 #include LAW
 
 struct HyperelasticElements {
@@ -36,21 +36,7 @@ KERNEL(elements, HyperelasticElements) {
 
     local_vec3 impulse[4];
     forces<HAS>(w, q, left, t, -p.h * volume, impulse);
-    Blocks6<local_number> B;
-    invariant_edges<HAS>(w, q, left, t, k, B);
-    if (p.projection != NONE) {
-        auto wrong = indefinite(B);
-        if (any(wrong)) {
-            Principal<local_number> frame = principal(t.F);
-            lift_modes(frame, modes<HAS>(w, frame.s), p.projection, wrong, k, t.D, B);
-        }
-    }
-    if constexpr (REFUSES) {
-        auto here = t.J <= 0 && floor == 0;
-        note_refusal(here, p.refused, i, p.clock[0], t.J);
-        refuse(here, B, impulse);
-    }
-    store_element(B, impulse, v, p.corners, p.edges, p.n, i);
+    put_element<HAS, REFUSES>(p, i, t, q, w, left, k, floor, v, impulse);
 }
 
 struct HyperelasticForces {
@@ -77,13 +63,7 @@ KERNEL(forces, HyperelasticForces) {
     Invariants<local_number> q = invariants<HAS>(left, t.J);
     local_vec3 impulse[4];
     forces<HAS>(slopes(c, q, floor), q, left, t, -p.h * at_items(p.volume, i), impulse);
-    if constexpr (REFUSES) {
-        auto here = t.J <= 0 && floor == 0;
-        Blocks6<local_number> none = {};
-        note_refusal(here, p.refused, i, p.clock[0], t.J);
-        refuse(here, none, impulse);
-    }
-    UNROLL for (int a = 0; a < 4; ++a) put_row(p.impulses + 3 * (long long)p.n * a, i, p.n, {impulse[a].x, impulse[a].y, impulse[a].z});
+    put_impulses<REFUSES>(p, i, t.J, floor, impulse);
 }
 
 struct HyperelasticEnergy {

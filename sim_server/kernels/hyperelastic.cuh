@@ -300,6 +300,12 @@ template <class T> INLINE Jet<T> logarithm(T J, T floor) {
     return below({log(base), inverse, -inverse * inverse}, J, floor);
 }
 
+// bulk/2 ln^2 J
+template <class T> INLINE Jet<T> half_squared_logarithm(T bulk, T J, T floor) {
+    Jet<T> L = logarithm(J, floor);
+    return {(entry<T>)0.5 * bulk * L.f * L.f, bulk * L.f * L.d, bulk * (L.d * L.d + L.f * L.dd)};
+}
+
 // Powers J^(-2 i / 3), as isochoric invariants have them.
 template <class T> struct Thirds {
     T root, inverse, J, floor;  // base^(-2/3) and 1 / base, base = max(J, floor)

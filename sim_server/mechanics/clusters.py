@@ -53,6 +53,14 @@ class PatchedCells:
     dilating: Clusters
 
 
+@dataclass(frozen=True)
+class PatchedTetrahedra:
+    """Tetrahedra (m, 4) that write the blocks of their edges, and clusters of the nodes of their patches."""
+
+    elements: Int32
+    patches: Clusters
+
+
 def couplings(clusters: Clusters, world: World) -> Couplings:
     """Keys row * n + column, corners (k, 2) and owners (k,) of all couplings above the diagonal between free nodes.
 

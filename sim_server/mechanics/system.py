@@ -9,15 +9,16 @@ all in the world frame; kernels/nodes.cu (`rotate`) and kernels/rotate_blocks.cu
 frame, where the solve happens.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
 from sim_server.arrays import Float64, Int32, Int64
 from sim_server.backends.base import Launch
 from sim_server.mechanics import clusters
-from sim_server.mechanics.clusters import Couplings, PatchedCells
+from sim_server.mechanics.clusters import Couplings, PatchedCells, PatchedTetrahedra
 from sim_server.mechanics.world import World
 
 
@@ -31,7 +32,7 @@ class Stencil:
 
     Of strain cells with any number of nodes (clusters.py) corners are their slots, pairs (k, 2) the slots that couple;
     corner_owners, pair_owners: the cell of each; patches: the same of their patches; dilating: of cells that have a
-    dilatation alone, None if there are none.
+    dilatation alone, None if there are none. Of tetrahedra in patches corners and pairs are those of elements.
     """
 
     corner_start: Int32
@@ -44,11 +45,14 @@ class Stencil:
     dilating: "Stencil | None" = None
 
 
+Coupled = Int32 | PatchedCells | PatchedTetrahedra
+
+
 class System:
     """Pattern and arrays of A' and b' for a world and the elements of its effects.
 
-    elements: per effect, (m, c) node numbers of the elements that couple their corners, c = 2 or 4, or strain cells and
-        their patches.
+    elements: per effect, (m, c) node numbers of the elements that couple their corners, c = 2 or 4, or strain cells or
+        tetrahedra and their patches.
 
     moving (bodies,): 1 if a node of the body does not rest, so that the step is solved; set by `rotate`
         (kernels/nodes.cu) and cleared by the loop
@@ -61,23 +65,17 @@ class System:
         launches are made
     """
 
-    def __init__(self, world: World, elements: Sequence[Int32 | PatchedCells]):
+    def __init__(self, world: World, elements: Sequence[Coupled]):
         n = world.nodes
         self.world = world
-        couplings = [_couplings(e, world, n) for e in elements if isinstance(e, np.ndarray)]
-        patched = [_patched(e, world) for e in elements if isinstance(e, PatchedCells)]
-        every = [keys for keys, _ in couplings] + [found[0] for pair in patched for found in pair]
-        keys = np.unique(np.concatenate([np.zeros(0, np.int64), *every]))
+        places = [_places_of(e, world) for e in elements]
+        keys = np.unique(np.concatenate([np.zeros(0, np.int64), *(each for place in places for each in place.keys)]))
         rows, columns = (part.astype(np.int32) for part in np.divmod(keys, n))
         above = rows < n
         self.row, self.column = rows[above], columns[above]
         self.held_rows, self.held_columns = rows - np.int32(n), columns
         self._number(n)
-        fixed, ragged = iter(couplings), iter(patched)
-        self.stencils = [
-            _patched_stencil(e, next(ragged), n, keys) if isinstance(e, PatchedCells)
-            else _stencil(e, next(fixed), n, keys) for e in elements
-        ]  # fmt: skip
+        self.stencils = [place.stencil(n, keys) for place in places]
 
         self.sums = np.zeros((len(keys), 3, 3))
         self.values = np.zeros((len(self.columns), 3, 3))
@@ -218,8 +216,26 @@ def _couplings(elements: Int32, world: World, n: int) -> tuple[Int64, Int32]:
     return np.concatenate(keys), np.concatenate(pairs)
 
 
-def _patched(elements: PatchedCells, world: World) -> list[Couplings]:
-    return [clusters.couplings(each, world) for each in (elements.cells, elements.patches, elements.dilating)]
+@dataclass(frozen=True)
+class _Places:
+    """What an effect couples.
+
+    keys: of its blocks, row * nodes + column; stencil: makes its places from the number of nodes and the keys of all
+    """
+
+    keys: list[Int64]
+    stencil: Callable[[int, Int64], Stencil]
+
+
+def _places_of(coupled: Coupled, world: World) -> _Places:
+    if isinstance(coupled, PatchedCells):
+        found = [clusters.couplings(each, world) for each in (coupled.cells, coupled.patches, coupled.dilating)]
+        return _Places([keys for keys, *_ in found], partial(_patched_stencil, coupled, found))
+    if isinstance(coupled, PatchedTetrahedra):
+        pairs, of_patches = _couplings(coupled.elements, world, world.nodes), clusters.couplings(coupled.patches, world)
+        return _Places([pairs[0], of_patches[0]], partial(_stencil_of_tetrahedra, coupled, pairs, of_patches))
+    pairs = _couplings(coupled, world, world.nodes)
+    return _Places([pairs[0]], partial(_stencil, coupled, pairs))
 
 
 def _patched_stencil(elements: PatchedCells, found: list[Couplings], n: int, blocks: Int64) -> Stencil:
@@ -227,6 +243,13 @@ def _patched_stencil(elements: PatchedCells, found: list[Couplings], n: int, blo
     cells, patches, dilating = (clusters.places(g, f, n, blocks) for g, f in zip(groups, found, strict=True))
     alone = Stencil(*dilating) if len(elements.dilating.nodes) else None
     return Stencil(*cells, Stencil(*patches), alone)
+
+
+def _stencil_of_tetrahedra(
+    coupled: PatchedTetrahedra, pairs: tuple[Int64, Int32], of_patches: Couplings, n: int, blocks: Int64
+) -> Stencil:
+    patches = Stencil(*clusters.places(coupled.patches, of_patches, n, blocks))
+    return replace(_stencil(coupled.elements, pairs, n, blocks), patches=patches)
 
 
 def _stencil(elements: Int32, couplings: tuple[Int64, Int32], n: int, blocks: Int64) -> Stencil:

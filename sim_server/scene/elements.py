@@ -14,6 +14,7 @@ Elements = Literal["auto", "linear", "patch", "smoothed", "quadratic"]
 Kind = Literal["linear", "patch", "smoothed", "quadratic"]
 LAWS = ("arruda_boyce", "costa", "mooney_rivlin", "neo_hookean", "ogden", "stable_neo_hookean", "st_venant_kirchhoff",
         "veronda_westmann")  # fmt: skip
+PATCHED = ("arruda_boyce", "mooney_rivlin", "neo_hookean", "stable_neo_hookean", "veronda_westmann")  # may be "patch"
 
 
 class HasElements(Protocol):
@@ -35,8 +36,8 @@ class HasElements(Protocol):
 def element_errors(objects: Sequence[HasElements], integrator: IntegratorOptions) -> Iterator[InitErrorDetails]:
     """Yields an error for each object whose effects or integrator have no such elements."""
     for index, o in enumerate(objects):
-        wrong = _reason(o.effects, integrator)
-        if wrong and o.elements not in ("auto", "linear"):
+        wrong = "" if o.elements in ("auto", "linear") else _reason(o.elements, o.effects, integrator)
+        if wrong:
             message = f'elements = "{o.elements}" {wrong}'
             yield InitErrorDetails(type=complaint(message), loc=("object", index, "elements"), input=o.elements)
 
@@ -45,23 +46,26 @@ def kind_of_elements(o: HasElements, mesh: Mesh, integrator: IntegratorOptions) 
     """Returns the kind that an object with this mesh has."""
     if o.elements != "auto":
         return o.elements
-    if _reason(o.effects, integrator):
-        return "linear"
-    return "smoothed" if mesh.quadratic is None else "quadratic"
+    others: Kind = "smoothed" if mesh.quadratic is None else "quadratic"
+    return "linear" if _reason(others, o.effects, integrator) else others
 
 
 def keeps_mid_nodes(o: HasElements, integrator: IntegratorOptions) -> bool:
     """Returns whether an object has quadratic elements if its mesh has mid-nodes."""
-    return o.elements == "quadratic" or (o.elements == "auto" and not _reason(o.effects, integrator))
+    return o.elements == "quadratic" or (o.elements == "auto" and not _reason("quadratic", o.effects, integrator))
 
 
-def _reason(effects: Mapping[str, Any], integrator: IntegratorOptions) -> str:
-    """Returns why an object can have linear elements alone; empty if it may have others."""
-    if laws := [name for name in LAWS if name in effects]:
-        return f'with the effect {laws[0]}, which has linear elements alone; allowed: "auto", "linear"'
-    if "corotational" not in effects:
-        return 'without the effect corotational, which alone has such elements; allowed: "auto", "linear"'
-    if effects["corotational"].rotation == "qr":
+def _reason(elements: Elements, effects: Mapping[str, Any], integrator: IntegratorOptions) -> str:
+    """Returns why an object cannot have such elements, other than linear ones; empty if it may."""
+    laws = [name for name in LAWS if name in effects]
+    if linear := [name for name in laws if name not in PATCHED]:
+        return f'with the effect {linear[0]}, which has linear elements alone; allowed: "auto", "linear"'
+    if laws and elements != "patch":
+        return f'with the effect {laws[0]}, whose elements are linear or in patches; allowed: "auto", "linear", "patch"'
+    if not laws and "corotational" not in effects:
+        others = f" or one of {', '.join(PATCHED)}" if elements == "patch" else ""
+        return f'without the effect corotational{others}, which alone have such elements; allowed: "auto", "linear"'
+    if "corotational" in effects and effects["corotational"].rotation == "qr":
         return 'with corotational.rotation = "qr", which is that of tetrahedra; allowed: "auto", "linear"'
     if integrator.explicit:
         given = f'integrator.scheme = "{integrator.scheme}"'

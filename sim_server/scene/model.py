@@ -98,7 +98,9 @@ class SceneObject(Parameters):
     masses: Literal["volume", "equal"] = Field(
         default="volume", description="nodal masses: a quarter of each adjacent element, or the same for every node"
     )
-    elements: Elements = Field(default="auto", description="of the effect corotational: what shares one strain")
+    elements: Elements = Field(
+        default="auto", description="of corotational and some hyperelastic laws: what shares one strain"
+    )
     friction: Annotated[NotNegative | None, Live(0, 1.5)] = Field(
         default=None, description="coefficient of its surface [-]; 0.5 where the scene lists contact"
     )

@@ -7,7 +7,8 @@ import numpy as np
 
 from sim_server.mechanics.world import Body
 from sim_server.scene import SceneObject
-from sim_server.scene.elements import element_errors
+from sim_server.scene.elements import PATCHED, element_errors
+from sim_server.scene.integrator_options import IntegratorOptions
 from sim_server.simulation import Simulation
 
 LOCKS = 0.45  # Poisson's ratio above which a note is due, to two digits: laws may have it from other constants
@@ -28,7 +29,7 @@ def locking_notes(simulation: Simulation) -> Iterator[tuple[list[Body], str]]:
     for body, poisson in sorted(_nearly_incompressible(simulation).items()):
         b = simulation.world.bodies[body]
         mesh: str = objects[b.name].mesh.split or "unstructured"
-        alike.setdefault((mesh, poisson, _remedy(objects[b.name], simulation)), []).append(b)
+        alike.setdefault((mesh, poisson, _remedy(objects[b.name], simulation.scene.integrator)), []).append(b)
     for (mesh, poisson, remedy), bodies in alike.items():
         of = "an unstructured mesh" if mesh == "unstructured" else f'split = "{mesh}"'
         lost = f"{100 * (1 - kept(mesh, poisson)):.0f} %"
@@ -51,14 +52,15 @@ def _nearly_incompressible(simulation: Simulation) -> dict[int, float]:
     found: dict[int, float] = {}
     for effect in simulation.effects.values():
         for body, (_, poisson) in effect.elastic.items():
-            linear = effect.name != "corotational" or simulation.world.bodies[body].elements == "linear"
-            if linear and round(float(poisson.max()), 2) > LOCKS:
+            others = effect.name in ("corotational", *PATCHED) and simulation.world.bodies[body].elements != "linear"
+            if not others and round(float(poisson.max()), 2) > LOCKS:
                 found[body] = max(found.get(body, 0.0), float(poisson.max()))
     return found
 
 
-def _remedy(o: SceneObject, simulation: Simulation) -> str:
-    others = not list(element_errors([o.model_copy(update={"elements": "smoothed"})], simulation.scene.integrator))
-    ways = ['elements = "smoothed" does not lock'] if others else []
+def _remedy(o: SceneObject, integrator: IntegratorOptions) -> str:
+    kinds = ("smoothed", "patch")
+    others = [k for k in kinds if not list(element_errors([o.model_copy(update={"elements": k})], integrator))]
+    ways = [f'elements = "{kind}" does not lock' for kind in others[:1]]
     ways += ['split = "mirrored" locks less'] if o.mesh.split == "kuhn" else []
     return ", ".join(ways) or "a finer mesh locks less"

@@ -18,6 +18,7 @@ from sim_server.backends.gpu.device import options as device_options
 from sim_server.backends.gpu.energies import BALANCE_TEXT
 from sim_server.backends.gpu.engine import EPILOGUE
 from sim_server.backends.kernel_binding import domain_of, members_of
+from sim_server.scene.elements import PATCHED
 from tests.support import nvrtc
 
 PUSH = """#include "kernel.h"
@@ -180,8 +181,10 @@ def test_layouts_are_those_of_the_compiler(folder):
 SOURCES = backend.SOURCES
 LAWS = sorted(p.relative_to(SOURCES).as_posix() for p in SOURCES.glob("effects/*.cuh"))
 FRAME = "kernels/hyperelastic.cu"  # of the laws: no text by itself
+PATCH_FRAMES = ("kernels/hyperelastic_cells.cu", "kernels/hyperelastic_patches.cu")  # of those in PATCHED
 GPU_TEXTS = sorted(p.relative_to(SOURCES).as_posix() for p in SOURCES.rglob("*.cu"))
-GPU_TEXTS = [path for path in GPU_TEXTS if path != FRAME] + [f"{FRAME}+{law}" for law in LAWS]
+GPU_TEXTS = [path for path in GPU_TEXTS if path not in (FRAME, *PATCH_FRAMES)] + [f"{FRAME}+{law}" for law in LAWS]
+GPU_TEXTS += [f"{frame}+effects/{law}.cuh" for frame in PATCH_FRAMES for law in PATCHED]
 TEXTS = [path for path in GPU_TEXTS if not path.startswith("backends/gpu/")]
 WHOLE = {f"backends/gpu/{name}.cu" for name in ("apply_factor", "newton", "pcg")}
 
@@ -315,21 +318,26 @@ CELL_NODES = [
     NODES[0],
     ("effects/corotational_cell_sums.cu", "CellNodes", "corotational_cell_sums.gather"),
     ("effects/corotational_cell_sums.cu", "ExactCellNodes", "corotational_cell_sums.gather_exact"),
-    ("effects/corotational_patches.cu", "PatchNodes", "corotational_patches.own_blocks"),
+    ("kernels/patch_blocks.cu", "PatchNodes", "patch_blocks.own_blocks"),
     ("effects/corotational_cell_sums.cu", "TwistNodes", "corotational_cell_sums.gather_twists"),
     *NODES[-1:],
 ]
 CELL_BLOCKS = [
     ("effects/corotational_cell_sums.cu", "CellBlocks", "corotational_cell_sums.blocks"),
     ("effects/corotational_cell_sums.cu", "ExactCellBlocks", "corotational_cell_sums.blocks_exact"),
-    ("effects/corotational_patches.cu", "PatchBlocks", "corotational_patches.blocks"),
+    ("kernels/patch_blocks.cu", "PatchBlocks", "patch_blocks.blocks"),
     ("effects/corotational_cell_sums.cu", "TwistBlocks", "corotational_cell_sums.twist_blocks"),
     ("kernels/rotate_blocks.cu", "RotateBlocks", "rotate_blocks.rotate_blocks"),
 ]
 LAW_ELEMENTS = [
     (f"{FRAME}+effects/neo_hookean.cuh", "HyperelasticElements", "neo_hookean.elements"),
     (f"{FRAME}+effects/mooney_rivlin.cuh", "HyperelasticElements", "mooney_rivlin.elements"),
+    (f"{PATCH_FRAMES[0]}+effects/neo_hookean.cuh", "HyperelasticPatchElements", "neo_hookean.elements"),
     ("effects/fibres.cu", "FibresElements", "fibres.elements"),
+]
+LAW_PATCHES = [
+    (f"{PATCH_FRAMES[1]}+effects/neo_hookean.cuh", "PatchPressures", "neo_hookean.pressures"),
+    (f"{PATCH_FRAMES[1]}+effects/mooney_rivlin.cuh", "PatchPressures", "mooney_rivlin.pressures"),
 ]
 OTHER_SCHEME = [("kernels/time_integration.cu", "Inertia", "time_integration.inertia"), *NODES[1:]]
 BLOCKS = [
@@ -345,13 +353,14 @@ BLOCKS = [
 @pytest.mark.parametrize(("real", "local"), [("double", "double"), ("double", "float"), ("float", "float")])
 @pytest.mark.parametrize(
     "group",
-    [NODES, OTHER_SCHEME, BLOCKS, ELEMENTS, LAW_ELEMENTS, CELLS, CELL_ELEMENTS, CELL_NODES, CELL_BLOCKS],
+    [NODES, OTHER_SCHEME, BLOCKS, ELEMENTS, LAW_ELEMENTS, LAW_PATCHES, CELLS, CELL_ELEMENTS, CELL_NODES, CELL_BLOCKS],
     ids=[
         "nodes",
         "other scheme",
         "blocks",
         "elements",
         "laws",
+        "their patches",
         "cells",
         "their elements",
         "their nodes",
@@ -369,9 +378,8 @@ def test_launches_put_together_compile_in_every_precision(group, real, local, tm
     assert together == launches
     shape = kernel_fusion.BlockShape(64, 4)
     made = kernel_fusion.FusedSource(launches, shape, None, private)  # type: ignore[arg-type]
-    assert (group in (ELEMENTS, LAW_ELEMENTS, CELLS, CELL_ELEMENTS) or private) and made.source.count("[3];") >= len(
-        private
-    )
+    assert private or group in (ELEMENTS, LAW_ELEMENTS, LAW_PATCHES, CELLS, CELL_ELEMENTS)
+    assert made.source.count("[3];") >= len(private)
     text = tmp_path / "together.cu"
     text.write_text(made.source)
     options = ["-arch=sm_90", "-std=c++17", f"-Dreal={real}", f"-Dlocal={local}", f"-I{backend.INCLUDE}"]

@@ -59,6 +59,12 @@ SCENES = {
         "integrator.scheme=ros2",
     ),
     "beam.toml, smoothed, Newton": ("object.beam.elements=smoothed", "integrator.linearizations=3"),
+    "fibres.toml, patches": ("object.beam.elements=patch", "integrator.linearizations=3"),
+    "fibres.toml, patches in float32, ros2": (
+        "object.beam.elements=patch",
+        "solver.precision=float32",
+        "integrator.scheme=ros2",
+    ),
     "springs.toml": (),
     "fibres.toml": ("integrator.scheme=bdf2",),
     "equilibrium.toml": (),

@@ -14,6 +14,7 @@ pytestmark = pytest.mark.gpu
 
 ARRAYS = ("values", "b_material", "y", "rotation")
 INSTEAD = "object.beam.effects.corotational=false"
+PATCHES = "object.beam.elements=patch"
 
 
 def law(name: str, projection: str = "clamp", **constants: Any) -> list[str]:
@@ -45,6 +46,9 @@ CASES = {  # scene, overrides, how far nodes are moved [m], cells being 0.2 m
     "mooney_rivlin": ("beam", law("mooney_rivlin", c1=5e4, c2=3e4, bulk=8e5), 0.02),
     "arruda_boyce": ("beam", law("arruda_boyce", shear=1e5, segments=5.0, bulk=8e5), 0.02),
     "veronda_westmann": ("beam", law("veronda_westmann", c1=3e4, c2=3.0, bulk=8e5), 0.02),
+    "neo_hookean, patches": ("beam", [*law("neo_hookean", **ELASTIC), PATCHES], 0.02),
+    "stable_neo_hookean, patches": ("beam", [*law("stable_neo_hookean", "excess", **ELASTIC), PATCHES], 0.05),
+    "mooney_rivlin, patches": ("beam", [*law("mooney_rivlin", c1=5e4, c2=3e4, bulk=8e5), PATCHES], 0.02),
     "ogden": ("beam", law("ogden", mu=[6e4, -1e4], alpha=[1.3, -2.0], bulk=8e5), 0.02),
     "costa": ("beam", law("costa", a=9e3, bulk=8e5, fibre=[1, 0.2, 0], sheet=[0, 1, 0.3]), 0.02),
     "fibres beside": (

@@ -88,7 +88,8 @@ LAWS = {
 def law_bar(law: Law | str, mesh: Any = None, table: dict[str, Any] | None = None, **scene: Any) -> Simulation:
     """A bar of this law. mesh: its table; keywords of tests.scenes.bar and of the solver go there."""
     name = law if isinstance(law, str) else law.name
-    body = {k: scene.pop(k) for k in ("cells", "size", "fixed", "damping", "density", "touch") if k in scene}
+    keys = ("cells", "size", "fixed", "damping", "density", "touch", "elements")
+    body = {k: scene.pop(k) for k in keys if k in scene}
     table = table or (law.table if isinstance(law, Law) else ELASTIC)
     o = bar(young=None, **({"mesh": mesh} if mesh else {}), **body)
     o["effects"][name] = table

@@ -46,9 +46,17 @@ def test_the_largest_ratio_of_regions_counts():
     assert "ratio of 0.48 " in line
 
 
-def test_laws_have_no_other_elements():
+def test_laws_with_patches_are_told_of_them():
     o = bar(mesh=MIRRORED, young=None)
     o["effects"]["neo_hookean"] = {"young": 1e5, "poisson": 0.48}
+    [line] = noted(o)
+    assert line.endswith('; elements = "patch" does not lock')
+    assert noted({**o, "elements": "patch"}) == []
+
+
+def test_other_laws_have_no_patches():
+    o = bar(mesh=MIRRORED, young=None)
+    o["effects"]["st_venant_kirchhoff"] = {"young": 1e5, "poisson": 0.48}
     [line] = noted(o)
     assert line.endswith("; a finer mesh locks less")
     [line] = noted(bar(mesh=KUHN, poisson=0.48, rotation="qr"))
