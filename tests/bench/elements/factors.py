@@ -12,7 +12,8 @@ TETS = {"linear": 1429, "patch": 1429, "smoothed": 1429, "quadratic": 218}  # wi
 HOW = """\
 The same bar in backward Euler of 10 ms, on an unstructured mesh of 1429 tetrahedra, or 218 quadratic ones, which have
 about as many nodes. Mean number of iterations of conjugate gradients under lockstep-3, -10 and -30, which take up a
-factor so many steps after its matrix, from the first one on: the bar falls and swings; – where a solve did not converge."""
+factor so many steps after its matrix, from the first one on: the bar falls and swings; – where a solve did not
+converge."""
 
 
 def iterations(kind: str, mesh: str, poisson: float, age: int, steps: int) -> float | None:
