@@ -173,6 +173,8 @@ def answers(runs: list[Run], wanted: float) -> list[dict[str, Any]]:
 def diagram(runs: list[Run]) -> Any:
     """Error over milliseconds, a panel for each mesh and Poisson's ratio."""
     plt = plots()
+    from matplotlib.ticker import LogLocator
+
     ratios, families = ([*dict.fromkeys(getattr(run, name) for run in runs)] for name in ("poisson", "family"))
     figure, axes = plt.subplots(len(families), len(ratios), figsize=(3.6 * len(ratios), 3.6 * len(families)),
                                 sharex=True, sharey=True, squeeze=False, layout="constrained")  # fmt: skip
@@ -185,6 +187,9 @@ def diagram(runs: list[Run]) -> Any:
         for wanted in WANTED:
             axis.axhline(wanted, color="gray", linewidth=0.8)
         axis.set(title=f"{family}, Poisson's ratio {poisson:g}", xscale="log", yscale="log")
+        axis.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+        axis.xaxis.set_major_formatter("{x:g}")
+        axis.xaxis.set_minor_formatter("")
         axis.grid(True, which="both", alpha=0.3)
     for axis in axes[:, 0]:
         axis.set_ylabel("error of the motion / length")
