@@ -46,6 +46,7 @@ Error: root mean square over time of the distance of the four corners of the fre
 {finest} x {finest} x {four} cells of quadratic elements and the same steps, over the length. ms a step: of a CPU the
 processor time of the loop, of a GPU the time of the device, median over the steps and the rounds, in which kinds take
 turns."""
+PICTURES = {"cpu": "elements.png", "gpu": "elements_gpu.png"}
 BETWEEN = "Between meshes on a line of logarithms; where a coarsest mesh is more exact, the time of that."
 
 
@@ -220,7 +221,7 @@ def main(
         report.table(answers(runs, wanted))
     for device in devices:
         picture = diagram([run for run in runs if run.device == device])
-        report.figure(picture, f"elements_{device}.png", f"Error of the motion against the time of a step, {device}.")
+        report.figure(picture, PICTURES[device], f"Error of the motion against the time of a step, {device}.")
     report.say("## Iterations with older factors", factors.HOW)
     boxes = {kind: _box(tets) for kind, tets in factors.TETS.items()}
     aged = factors.table(boxes, (0.45,) if quick else (0.3, 0.45, 0.499), 20 if quick else 150)

@@ -33,12 +33,14 @@ def statics(
         return static_scene(o, gravity, slender)
 
 
-def static_scene(table: dict[str, Any], gravity: Any = None, slender: bool = True) -> Simulation:
-    """The same of the table of an object."""
+def static_scene(
+    table: dict[str, Any], gravity: Any = None, slender: bool = True, exact: float = 1e-8
+) -> Simulation:  # fmt: skip
+    """The same of the table of an object, each step to `exact` of its first residual."""
     preconditioner, newton = ("cholesky", NEWTON) if slender else ("block_jacobi", NEWTON | {"trials": 8})
     return simulation(
-        table, gravity=gravity, integrator=newton, dt=1.0, update="every-1", preconditioner=preconditioner,
-        factor_precision="float64", tolerance=1e-9, max_iterations=3000, projection="none",
+        table, gravity=gravity, integrator=newton | {"tolerance": exact}, dt=1.0, update="every-1",
+        preconditioner=preconditioner, factor_precision="float64", tolerance=0.1 * exact, max_iterations=3000, projection="none",
     )  # fmt: skip
 
 

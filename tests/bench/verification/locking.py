@@ -25,7 +25,7 @@ from tests.reference.quadratic_statics import SAG, SIZE, Mesh10, with_mid_nodes
 Reals = NDArray[np.float64]
 MESHES = Path(__file__).parent / "meshes"
 CELLS = (5, 5, 20)
-YOUNG, DENSITY, GRAVITY = 1e6, 1000.0, 1e-4  # small: nothing but Hooke's law
+YOUNG, DENSITY, GRAVITY = 1e6, 1000.0, 1e-3  # small: nothing but Hooke's law
 SOURCE = "quadratic tetrahedra, 24,000, apart (tests/reference/quadratic_statics.py)"
 UNKNOWN = (InputError, ValidationError)  # what a version says of elements and effects that it does not have
 MOST = {"linear": 0.95, "patch": 0.3, "smoothed": 0.1, "quadratic": 0.1}  # of the sag, lost or too much
@@ -71,7 +71,7 @@ def body(
             "name": "bar", "mesh": mesh_table(Path(folder), rest, tets, kind), "elements": kind, "density": density,
             "effects": {"corotational": law, "fixed": fixed, "touch": {"max_force": 1e30}},
         }  # fmt: skip
-        return static_scene(table, gravity)
+        return static_scene(table, gravity, exact=1e-5)  # rounding of the largest Poisson's ratio is below
 
 
 def kinds() -> list[str]:
