@@ -40,7 +40,8 @@ def static_scene(
     preconditioner, newton = ("cholesky", NEWTON) if slender else ("block_jacobi", NEWTON | {"trials": 8})
     return simulation(
         table, gravity=gravity, integrator=newton | {"tolerance": exact}, dt=1.0, update="every-1",
-        preconditioner=preconditioner, factor_precision="float64", tolerance=0.1 * exact, max_iterations=3000, projection="none",
+        preconditioner=preconditioner, factor_precision="float64", tolerance=0.1 * exact, max_iterations=3000,
+        projection="none",
     )  # fmt: skip
 
 
