@@ -35,6 +35,7 @@ SCENES = {
     "beam.toml, Newton": ("integrator.linearizations=3", "integrator.scheme=newmark"),
     "beam.toml, accuracy": ("accuracy.position='1 %'", "solver.precision=mixed"),
     "floor_drop.toml, accuracy": ("accuracy.position=1e-4",),
+    "two_organs.toml, smoothed": ("object.tissue.elements=smoothed", "object.kidney.elements=smoothed"),
     "beam.toml, ros2": ("integrator.scheme=ros2", "solver.preconditioner=cholesky"),
     "beam.toml, ros2 in float32": (
         "integrator.scheme=ros2",
