@@ -42,7 +42,8 @@ from sim_server.backends.base import Launch
 from sim_server.backends.energies import ElementEnergies
 from sim_server.backends.state import rows_in
 from sim_server.effects._base import Effect, PerBody
-from sim_server.mechanics.clusters import PatchedCells, sliced, united
+from sim_server.effects._patch_blocks import patch_blocks
+from sim_server.mechanics.clusters import PatchedCells, members, sliced, united
 from sim_server.mechanics.system import Stencil, System
 from sim_server.mechanics.world import Body, World
 from sim_server.mesh.cell_builders import edge_cells, tetrahedron_cells
@@ -53,7 +54,6 @@ from sim_server.scene.regions import region_numbers
 
 Constants = tuple[Float64, Float64]
 TEXT, PATCHES, SUMS = (f"effects/corotational_{name}.cu" for name in ("cells", "patches", "cell_sums"))
-BLOCKS = "kernels/patch_blocks.cu"
 
 
 @dataclass(frozen=True)
@@ -110,10 +110,8 @@ class StrainCellElements(Effect):
         alone = self.slices.clusters.taken(dilating & ~strained)
         self._coupled = PatchedCells(self.slices.clusters.taken(strained), patches, alone)
         self._corners = Lists(start, clusters.owner[corners], clusters.slots[corners])
-        members = np.flatnonzero(dilating)
-        order = members[np.argsort(cells.patch[members], kind="stable")].astype(np.int32)
-        begin = np.searchsorted(cells.patch[order], np.arange(cells.patches + 1)).astype(np.int32)
-        self._members = Lists(begin, order, np.zeros(0, np.int32))
+        start, order = members(cells.patch[dilating], cells.patches)
+        self._members = Lists(start, np.flatnonzero(dilating)[order].astype(np.int32), np.zeros(0, np.int32))
         self.volume = cells.volume * dilating
         self.patch_volume = np.bincount(cells.patch, self.volume, cells.patches)
         self.inverse_volume = 1 / self.patch_volume
@@ -150,7 +148,7 @@ class StrainCellElements(Effect):
     @property
     def element_nodes(self) -> list[Int32]:
         cells, patches = self.slices.clusters, self._coupled.patches
-        return [cells.nodes[cells.start[:-1]], patches.nodes[patches.start[:-1]], patches.nodes]
+        return [cells.first_nodes, patches.first_nodes, patches.nodes]
 
     def rows_of_bodies(self, array: NDArray[Any]) -> Callable[[int], Any] | None:
         return rows_in(self.owner) if array is self.near or array is self.quaternion else None
@@ -160,7 +158,7 @@ class StrainCellElements(Effect):
 
     def launches(self, system: System, stencil: Stencil | None, accumulate: bool) -> list[Launch]:
         assert stencil is not None and stencil.patches is not None
-        w, patches = self.world, stencil.patches
+        w = self.world
         exact = self.exact and not w.usual_tangent
         twist = {"twist": self.twist} if exact else {}
         elements = w.backend.module(TEXT).bind(
@@ -177,20 +175,13 @@ class StrainCellElements(Effect):
             owners=stencil.corner_owners, nodal_impulse=self.nodal_impulse, scaled_gradients=self.scaled_gradients,
             quaternion=self.quaternion, b=system.b, block=system.block, mean=system.mean, **twist,
         )  # fmt: skip
-        own = w.backend.module(BLOCKS).bind(
-            "own_blocks", w.nodes, start=patches.corner_start, corners=patches.corners,
-            patch_gradients=self.patch_gradients, block=system.block,
-        )  # fmt: skip
         owners = {"owners": stencil.pair_owners, **twist} if exact else {}
         blocks = w.backend.module(SUMS).bind(
             "blocks_exact" if exact else "blocks", len(system.sums), accumulate=int(accumulate),
             start=stencil.pair_start, pairs=stencil.pairs, scaled_gradients=self.scaled_gradients, sums=system.sums,
             **owners,
         )  # fmt: skip
-        of_patches = w.backend.module(BLOCKS).bind(
-            "blocks", len(system.sums), start=patches.pair_start, pairs=patches.pairs,
-            patch_gradients=self.patch_gradients, sums=system.sums,
-        )  # fmt: skip
+        own, of_patches = patch_blocks(w, system, stencil.patches, self.patch_gradients)
         forces = [*self._measured("measure", self.quaternion), elements, gradients, gather]
         return [*forces, own, blocks, of_patches, *self._of_dilating(system, stencil.dilating, exact)]
 

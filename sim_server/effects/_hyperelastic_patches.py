@@ -31,14 +31,13 @@ from sim_server.arrays import Float64, Int32
 from sim_server.backends.base import Launch
 from sim_server.backends.energies import ElementEnergies
 from sim_server.effects._hyperelastic import PROJECTIONS, Hyperelastic, Law, Values, lame
-from sim_server.mechanics.clusters import Clusters, PatchedTetrahedra, united
+from sim_server.effects._patch_blocks import patch_blocks
+from sim_server.mechanics.clusters import Clusters, PatchedTetrahedra, members, united
 from sim_server.mechanics.system import Stencil, System
 from sim_server.mechanics.world import Body, World
 from sim_server.mesh.patches import patches
 from sim_server.scene import Scene
 from sim_server.scene.regions import region_numbers
-
-BLOCKS = "kernels/patch_blocks.cu"
 
 
 class HyperelasticPatches(Hyperelastic):
@@ -73,8 +72,7 @@ class HyperelasticPatches(Hyperelastic):
         self._patches, self._slot_start, slots = united(clusters, self.patch, int(before[-1]))
         self._slots: Int32 = clusters.slots[slots]
         self._patch_of_corner = self._patches.owner
-        self._members: Int32 = np.argsort(self.patch, kind="stable").astype(np.int32)
-        self._member_start = np.searchsorted(self.patch[self._members], np.arange(before[-1] + 1)).astype(np.int32)
+        self._member_start, self._members = members(self.patch, int(before[-1]))
         self.patch_volume: Float64 = np.bincount(self.patch, self.volume).astype(np.float64)
         floor = np.zeros(len(self.patch_volume))
         floor[self.patch] = self.floor  # one in a body
@@ -86,8 +84,7 @@ class HyperelasticPatches(Hyperelastic):
 
     @property
     def element_nodes(self) -> list[Int32]:
-        nodes = self._patches.nodes
-        return [self.elements[:, 0], nodes[self._patches.start[:-1]], nodes]
+        return [self.elements[:, 0], self._patches.first_nodes, self._patches.nodes]
 
     def packed(self, law: Law) -> Float64:
         """Returns the constants of W_s (k, m), which follow the scene."""
@@ -109,7 +106,7 @@ class HyperelasticPatches(Hyperelastic):
 
     def launches(self, system: System, stencil: Stencil | None, accumulate: bool) -> list[Launch]:
         assert stencil is not None and stencil.patches is not None
-        w, of_patches = self.world, stencil.patches
+        w = self.world
         elements = w.backend.module(self.path).bind(
             "elements", len(self.elements), projection=PROJECTIONS[w.projection], tets=self.elements, x=w.x,
             gradients=self.gradients, volume=self.volume, constants=self.constants, patch=self.patch,
@@ -121,14 +118,7 @@ class HyperelasticPatches(Hyperelastic):
             patch=self._patch_of_corner, areas=self.areas, volume=self.patch_volume, weight=self.weight,
             patch_gradients=self.patch_gradients,
         )  # fmt: skip
-        own = w.backend.module(BLOCKS).bind(
-            "own_blocks", w.nodes, start=of_patches.corner_start, corners=of_patches.corners,
-            patch_gradients=self.patch_gradients, block=system.block,
-        )  # fmt: skip
-        blocks = w.backend.module(BLOCKS).bind(
-            "blocks", len(system.sums), start=of_patches.pair_start, pairs=of_patches.pairs,
-            patch_gradients=self.patch_gradients, sums=system.sums,
-        )  # fmt: skip
+        own, blocks = patch_blocks(w, system, stencil.patches, self.patch_gradients)
         forces, sums = self.gathers(system, stencil, accumulate)
         return [*self._measured(), elements, gradients, forces, own, sums, blocks]
 

@@ -52,10 +52,9 @@ struct ExactCellNodes {
 
 INLINE void gather_exact_add(const ExactCellNodes& p, int, int k, local* sum) {
     add_corner(p, k, sum);
-    local g[4], t[9] = {};
+    local g[4];
     get_row(p.scaled_gradients, p.corners[k], g);
-    add_twist(t, g, g, p.twist + 6 * p.owners[k]);
-    sum[3] += t[0]; sum[4] += t[1]; sum[5] += t[2]; sum[6] += t[4]; sum[7] += t[5]; sum[8] += t[8];
+    add_own_twist(sum + 3, g, p.twist + 6 * p.owners[k]);
 }
 INLINE void gather_exact_put(const ExactCellNodes& p, int i, const local* sum) { put_corners(p, i, sum); }
 SUM_KERNEL(gather_exact, ExactCellNodes, 19)
@@ -144,11 +143,10 @@ struct TwistNodes {
 
 INLINE void gather_twists_add(const TwistNodes& p, int, int k, local* sum) {
     const local* f = p.nodal_impulse + 3 * p.corners[k];
-    local g[4], t[9] = {};
+    local g[4];
     get_row(p.scaled_gradients, p.corners[k], g);
     for (int m = 0; m < 3; ++m) sum[m] += f[m];
-    add_twist(t, g, g, p.twist + 6 * p.owners[k]);
-    sum[3] += t[0]; sum[4] += t[1]; sum[5] += t[2]; sum[6] += t[4]; sum[7] += t[5]; sum[8] += t[8];
+    add_own_twist(sum + 3, g, p.twist + 6 * p.owners[k]);
 }
 
 INLINE void gather_twists_put(const TwistNodes& p, int i, const local* sum) {

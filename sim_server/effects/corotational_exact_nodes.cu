@@ -18,13 +18,12 @@ struct CorotationalExactNodes {
 INLINE void gather_add(const CorotationalExactNodes& p, int, int k, local* sum) {
     int corner = p.corners[k];
     const local* f = p.nodal_impulse + 3 * corner;
-    local g[4], q[4], t[9] = {};
+    local g[4], q[4];
     get_row(p.scaled_gradients, corner, g);
     get_row(p.quaternion, corner >> 2, q);
     for (int m = 0; m < 3; ++m) sum[m] += f[m];
     add_own(sum + 3, g);
-    add_twist(t, g, g, p.twist + 6 * (corner >> 2));
-    sum[3] += t[0]; sum[4] += t[1]; sum[5] += t[2]; sum[6] += t[4]; sum[7] += t[5]; sum[8] += t[8];
+    add_own_twist(sum + 3, g, p.twist + 6 * (corner >> 2));
     add_quaternion_product(sum + 9, q);
 }
 

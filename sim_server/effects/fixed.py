@@ -40,7 +40,7 @@ from sim_server.mechanics.rollers import Rollers, span_of
 from sim_server.mechanics.world import Body, World
 from sim_server.mesh import pose_matrix
 from sim_server.scene import where
-from sim_server.scene.parameters import Parameters, Where, as_tuple, complaint
+from sim_server.scene.parameters import Parameters, Where, as_tuple, complaint, where_or_tables
 
 SCOPE = "object"
 AXES = ("x", "y", "z")
@@ -78,10 +78,7 @@ class Params(Parameters):
 
     @model_validator(mode="after")
     def _one_form(self) -> "Params":
-        if (self.where is None) == (not self.tables):
-            raise complaint("needs where = ..., or a list of tables with where = ... each")
-        if self.tables is not None and self.along is not None:
-            raise complaint("along: stands in the tables of the list")
+        where_or_tables(self, ["along"])
         return self
 
     @property

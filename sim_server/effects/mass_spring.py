@@ -41,6 +41,7 @@ from sim_server.effects._base import Effect, PerBody, params_in
 from sim_server.errors import InputError
 from sim_server.mechanics.system import Stencil, System
 from sim_server.mechanics.world import Body, World
+from sim_server.mesh.surface import EDGES
 from sim_server.scene import Scene
 from sim_server.scene.live import STIFFNESS, Live
 from sim_server.scene.parameters import File, Parameters, Positive, as_tuple, complaint
@@ -49,7 +50,6 @@ from sim_server.scene.regions import Young, region_values
 SCOPE = "object"
 POISSON = 0.25  # of every network of springs without preferred directions
 CALIBRATION = 1.12  # of the stiffness, by stretching unstructured bars (tests/physics/test_mass_spring_young.py)
-EDGES = np.array([(0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)])  # of a tetrahedron
 
 Node = Annotated[int, Field(ge=0)]
 Pair = Annotated[tuple[Node, Node], BeforeValidator(as_tuple)]

@@ -49,7 +49,7 @@ from sim_server.mechanics.world import Body, World
 from sim_server.mesh.surface import surface_triangles
 from sim_server.scene import Scene, where
 from sim_server.scene.live import Live
-from sim_server.scene.parameters import Parameters, Vector, Where, as_tuple, complaint
+from sim_server.scene.parameters import Parameters, Vector, Where, as_tuple, complaint, where_or_tables
 
 SCOPE = "object"
 FLAT = 1e-6  # sine of the angle of normals, and of a moment to the plane, that count as none
@@ -63,10 +63,9 @@ ABOUT = {
 }
 
 
-def _some_load(load: Any) -> Any:
+def _some_load(load: Any) -> None:
     if all(getattr(load, kind) is None for kind in KINDS):
         raise complaint("needs one or more of force, stress, pressure and moment")
-    return load
 
 
 class Load(Parameters):
@@ -80,8 +79,8 @@ class Load(Parameters):
 
     @model_validator(mode="after")
     def _loads(self) -> "Load":
-        load: Load = _some_load(self)
-        return load
+        _some_load(self)
+        return self
 
 
 class Params(Parameters):
@@ -96,13 +95,9 @@ class Params(Parameters):
 
     @model_validator(mode="after")
     def _one_form(self) -> "Params":
-        if (self.where is None) == (not self.tables):
-            raise complaint("needs where = ..., or a list of tables with where = ... each")
+        where_or_tables(self, KINDS)
         if self.tables is None:
-            params: Params = _some_load(self)
-            return params
-        if given := [kind for kind in KINDS if getattr(self, kind) is not None]:
-            raise complaint(f"{given[0]}: stands in the tables of the list")
+            _some_load(self)
         return self
 
     @property

@@ -36,3 +36,10 @@ INLINE void add_twist(local* s, const local (&a)[4], const local (&b)[4], const 
     s[3] += a[2] * m0 - a[0] * m6; s[4] += a[2] * m1 - a[0] * m7; s[5] += a[2] * m2 - a[0] * m8;
     s[6] += a[0] * m3 - a[1] * m0; s[7] += a[0] * m4 - a[1] * m1; s[8] += a[0] * m5 - a[1] * m2;
 }
+
+// The same of one corner, a = b = g: the upper triangle (6,) of it.
+INLINE void add_own_twist(local* s, const local (&g)[4], const local* E) {
+    local t[9] = {};
+    add_twist(t, g, g, E);
+    s[0] += t[0]; s[1] += t[1]; s[2] += t[2]; s[3] += t[4]; s[4] += t[5]; s[5] += t[8];
+}

@@ -35,6 +35,11 @@ class Clusters:
         number = np.arange(len(self.start) - 1, dtype=np.int32) if self.number is None else self.number
         return np.repeat(number, np.diff(self.start))
 
+    @property
+    def first_nodes(self) -> Int32:
+        """First node of each, (m,)."""
+        return self.nodes[self.start[:-1]]
+
     def taken(self, mask: NDArray[np.bool_]) -> "Clusters":
         """Returns some of them, with the numbers that they have here. mask: (m,)"""
         sizes = np.diff(self.start)
@@ -109,6 +114,15 @@ def united(clusters: Clusters, group: Int32, groups: int) -> tuple[Clusters, Int
     made = Clusters(start, (slots % n).astype(np.int32), np.arange(len(slots), dtype=np.int32))
     counts = np.concatenate([[0], np.cumsum(np.bincount(of.ravel(), minlength=len(slots)))]).astype(np.int32)
     return made, counts, np.argsort(of.ravel(), kind="stable").astype(np.int32)
+
+
+def members(group: Int32, groups: int) -> tuple[Int32, Int32]:
+    """Returns the members of groups: start (groups + 1,) into them, and their numbers, ascending in each group.
+
+    group (m,): of each item
+    """
+    order = np.argsort(group, kind="stable").astype(np.int32)
+    return np.searchsorted(group[order], np.arange(groups + 1)).astype(np.int32), order
 
 
 def _by_size(start: Int32) -> Iterator[tuple[Int64, int]]:

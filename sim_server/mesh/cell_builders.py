@@ -11,8 +11,7 @@ from sim_server.arrays import Float64, Int32
 from sim_server.mesh.patches import patches
 from sim_server.mesh.shape_functions import shape_gradients
 from sim_server.mesh.strain_cells import DEVIATOR, DILATATION, StrainCells
-
-EDGES = np.array([(0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)])  # of a tetrahedron
+from sim_server.mesh.surface import EDGES
 
 
 def tetrahedron_cells(rest: Float64, tets: Int32, region: Int32) -> StrainCells:

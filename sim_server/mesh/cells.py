@@ -15,7 +15,7 @@ import numpy as np
 
 from sim_server.arrays import Float64, Int64
 from sim_server.errors import InputError
-from sim_server.mesh.surface import volumes
+from sim_server.mesh.surface import EDGES, volumes
 
 # Faces by corner numbers, normals outward, in the order of nodes that meshio has for every format (VTK's).
 FACES: dict[str, tuple[tuple[int, ...], ...]] = {
@@ -30,7 +30,6 @@ SHAPE = {  # of each type of cell that is read; the corners of quadratic ones co
     "wedge": "wedge", "wedge15": "wedge", "wedge18": "wedge",
     "pyramid": "pyramid", "pyramid13": "pyramid", "pyramid14": "pyramid",
 }  # fmt: skip
-EDGES = ((0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3))  # of a tetrahedron
 
 
 def tetrahedra(rest: Float64, blocks: Sequence[Any]) -> tuple[Int64, list[str]]:

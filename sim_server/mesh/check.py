@@ -10,11 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim_server.arrays import Float64
-from sim_server.mesh.surface import FACES, volumes
+from sim_server.mesh.surface import EDGES, FACES, volumes
 
 FLAT = 1e-12  # |volume| / (longest edge)^3 below which a tetrahedron is flat; rounding alone gives about 1e-15
 COINCIDENT = 1e-9  # distance / diagonal of the bounding box below which two nodes are one
-EDGES = ((0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3))
 NAMED = 3  # offenders named in a message
 
 Rest = Float64

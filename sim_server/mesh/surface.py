@@ -8,6 +8,7 @@ from sim_server.arrays import Float64, Int32, Int64
 
 # Faces of a tetrahedron of positive volume, normals outward by the right-hand rule.
 FACES = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])
+EDGES = np.array([(0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)])
 
 
 def volumes(rest: Float64, tets: NDArray[np.integer]) -> Float64:

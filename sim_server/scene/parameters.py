@@ -5,6 +5,7 @@ The tables of a scene and the `Params` of each effect derive from `Parameters`, 
 reported in the same words everywhere, together with the keys that exist.
 """
 
+from collections.abc import Sequence
 from difflib import get_close_matches
 from os.path import isfile
 from pathlib import Path
@@ -71,6 +72,15 @@ def nearest(word: str, known: list[str], what: str) -> str:
     similar = get_close_matches(word, known, n=3, cutoff=0.6)
     guess = f"; did you mean {' or '.join(repr(n) for n in similar)}?" if similar else ""
     return f"{guess} (known {what}: {', '.join(sorted(known))})"
+
+
+def where_or_tables(params: Any, beside: Sequence[str]) -> None:
+    """Raises unless an effect has either `where` or a list of `tables`, and of `beside` nothing next to the list."""
+    if (params.where is None) == (not params.tables):
+        raise complaint("needs where = ..., or a list of tables with where = ... each")
+    given = [key for key in beside if params.tables is not None and getattr(params, key) is not None]
+    if given:
+        raise complaint(f"{given[0]}: stands in the tables of the list")
 
 
 def as_tuple(value: Any) -> Any:

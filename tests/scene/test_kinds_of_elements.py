@@ -1,10 +1,12 @@
 # SPDX-License-Identifier: MIT
 """Which elements a body has where its scene names none."""
 
+import importlib
 from typing import Any
 
 import pytest
 
+from sim_server.scene.elements import LAWS, PATCHED
 from sim_server.simulation import Simulation
 from tests.scenes import bar, scene
 
@@ -28,3 +30,8 @@ def test_corotational_bodies_have_smoothed_ones(scheme: str):
 )  # fmt: skip
 def test_where_there_are_no_others_they_are_linear(effects: dict[str, Any], integrator: dict[str, Any] | None):
     assert kind(effects, integrator) == "linear"
+
+
+def test_laws_whose_elements_may_be_patches_are_those_with_a_part_of_volume():
+    laws = {name: importlib.import_module(f"sim_server.effects.{name}").LAW for name in LAWS}
+    assert {name for name, law in laws.items() if law.volumetric is not None} == set(PATCHED)
