@@ -4,6 +4,7 @@
 import contextlib
 import math
 import shutil
+import time
 from collections.abc import Iterator, Sequence
 from typing import Any
 
@@ -104,8 +105,17 @@ def field(tab: Any, label: str) -> Any:
 
 def choose_colour(tab: Any, mode: str) -> None:
     """Has a tab colour its bodies so (clients.web.paint.MODES)."""
-    field(tab, "colour").click(force=True)
-    tab.get_by_role("option", name=mode, exact=True).click(force=True)
+    from playwright.sync_api import Error
+
+    chosen, option = field(tab, "colour"), tab.get_by_role("option", name=mode, exact=True)
+    deadline = time.monotonic() + PATIENCE / 1000
+    while chosen.input_value() != mode:  # events, not places in the window: the panel moves while it is filled
+        if time.monotonic() > deadline:
+            raise TimeoutError(f"the page still has the colour {chosen.input_value()!r}, not {mode!r}")
+        if not option.count():
+            chosen.dispatch_event("click")
+        with contextlib.suppress(Error):  # the list may close or be drawn anew; then it is asked for again
+            option.dispatch_event("click", timeout=3000)
 
 
 def on_screen(tab: Any, view: View, point: Sequence[float] | NDArray) -> tuple[float, float]:
