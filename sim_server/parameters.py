@@ -102,9 +102,10 @@ class LiveParameters:
         self._first: ParameterUpdate | None = None  # the first one that the loop took up, or is to
 
     def __iter__(self) -> Iterator[LiveParameter]:
-        """All live parameters that the scene gives a value."""
+        """All live parameters that the scene gives a value, and that are listed."""
         for field in live_fields(self.scene):
-            yield self._described(field)
+            if field.live.listed:
+                yield self._described(field)
 
     @property
     def changed(self) -> dict[str, str]:

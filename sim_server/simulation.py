@@ -41,6 +41,7 @@ if TYPE_CHECKING:
     from sim_server.effects._holders import Holders  # imported where a scene has them
     from sim_server.effects._movable import Movable
     from sim_server.effects.contact import Contact  # imported where a scene lists it
+    from sim_server.effects.cutting import Cutting  # likewise
     from sim_server.effects.touch import Touch  # imported where a scene lists it
 
 KINDS = {"none": Kind.NONE, "jacobi": Kind.JACOBI, "block_jacobi": Kind.BLOCK_JACOBI, "ssor": Kind.SSOR}
@@ -158,7 +159,7 @@ class Simulation:
             self._mailed[self.holders] = 0
         stencils = iter(system.stencils)
         accumulate = False
-        for e in sorted(self.effects.values(), key=lambda e: e.elements is None):  # touch asks what the elements added
+        for e in sorted(self.effects.values(), key=_order):
             stencil = next(stencils) if e.elements is not None else None
             if e is self.contact and not detect:
                 continue
@@ -219,7 +220,7 @@ class Simulation:
     def force_launches(self, frames: bool) -> list[Launch]:
         """Returns the launches of a stage that needs no A. frames: those of the nodes are made, too."""
         stencils = iter(self.system.stencils)
-        ordered = sorted(self.effects.values(), key=lambda e: e.elements is None)
+        ordered = sorted(self.effects.values(), key=_order)
         parts = [
             e.force_launches(self.system, next(stencils) if e.elements is not None else None, frames) for e in ordered
         ]
@@ -332,6 +333,11 @@ class Simulation:
         return bsr_array((self.system.body_values(b.first, b.last).copy(), columns, row_start), shape=(n, n)).tocsc()
 
 
+def _order(effect: Effect) -> tuple[bool, bool]:
+    """Returns the place of an effect's launches: those of elements come before touch, which asks what they added."""
+    return not effect.comes_first, effect.elements is None
+
+
 def build_effects(scene: Scene, world: World) -> dict[str, Effect]:
     """The effects that the scene lists, and no others, by name (and variant)."""
     built: dict[str, Effect] = {}
@@ -349,4 +355,6 @@ def build_effects(scene: Scene, world: World) -> dict[str, Effect]:
     for name, params in sorted(scene.effects.items(), key=lambda item: item[0] != "gravity"):  # contact asks for it
         built[name] = effect(name).build(world, [(body, params) for body in world.bodies])
         built[name].name = name
+    if "cutting" in built:
+        cast("Cutting", built["cutting"]).check(built)
     return built

@@ -60,6 +60,16 @@ class Effect:
     elastic: Mapping[int, tuple[Float64, Float64]] = MappingProxyType({})
 
     @property
+    def cuttable(self) -> bool:
+        """True if it goes on rightly where elements of its bodies are removed (cutting.py)."""
+        return False
+
+    @property
+    def comes_first(self) -> bool:
+        """True if its launches run before those of other effects."""
+        return False
+
+    @property
     def coupled(self) -> Coupled | None:
         """What the system is to have places for (`stencil` of the launches)."""
         return self.elements

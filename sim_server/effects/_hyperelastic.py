@@ -57,6 +57,7 @@ from sim_server.backends.base import Launch
 from sim_server.backends.energies import ElementEnergies
 from sim_server.effects._base import Effect, PerBody, Refusal
 from sim_server.errors import InputError
+from sim_server.mechanics.removal import present
 from sim_server.mechanics.system import Stencil, System
 from sim_server.mechanics.world import Body, World
 from sim_server.mesh.shape_functions import shape_gradients
@@ -66,6 +67,7 @@ from sim_server.scene.parameters import Parameters, Positive
 from sim_server.scene.regions import Poisson, Regional, by_region, constants_by_region
 
 Values = Mapping[str, Float64]
+REMOVED_FLOOR = 0.5  # of elements that were removed, so that none of them is refused
 PROJECTIONS = {"none": 0, "clamp": 1, "absolute": 2, "excess": 3}  # kernels/hyperelastic.cuh
 
 
@@ -165,8 +167,10 @@ class Tetrahedra(Effect):
         counts = [len(body.mesh.tets) for body, _ in listed]
         self.owner = np.repeat([body.index for body, _ in listed], counts)[self.order]
         self.number = np.concatenate([np.arange(n) for n in counts])[self.order]
-        self.volume, gradients = shape_gradients(world.rest, self.elements)
-        self.gradients = np.ascontiguousarray(gradients.reshape(-1, 9).T)
+        volume, gradients = shape_gradients(world.rest, self.elements)
+        self.volume = world.follow("cutting", compute=lambda scene: volume * present(scene, self.bodies)[self.order])
+        rows = gradients.reshape(-1, 9).T
+        self.gradients = world.follow("cutting", compute=lambda scene: rows * present(scene, self.bodies)[self.order])
         self.corners, self.edges = np.zeros((4, m, 9)), np.zeros((6, m, 9))
         self._energy = np.zeros(m)
 
@@ -217,8 +221,18 @@ class Hyperelastic(Tetrahedra):
         if law.axes is not None:
             self.gradients = world.follow(law.name, compute=partial(self._gradients_along, law.axes, self.gradients))
         floors = [getattr(p, "floor", 0.0) if getattr(p, "inversion", "") == "regularize" else 0.0 for _, p in listed]
-        self.floor = np.repeat(floors, [len(body.mesh.tets) for body, _ in listed])[self.order]
+        floor = np.repeat(floors, [len(body.mesh.tets) for body, _ in listed])[self.order]
+
+        def defined(scene: Scene) -> Float64:
+            return np.where(present(scene, self.bodies)[self.order] > 0, floor, REMOVED_FLOOR)
+
+        self.floor = world.follow("cutting", compute=defined)
         self.refused = np.tile([-1.0, 0.0], (len(self.elements), 1))
+
+    @property
+    def cuttable(self) -> bool:
+        """True if the law is defined for elements that are inside out, as removed ones may be."""
+        return self.law.regularizes or not self.law.refuses
 
     def _gradients_along(self, axes_of: Callable[[Values], Float64], gradients: Float64, scene: Scene) -> Float64:
         """Returns gradients (9, m) by the material axes."""

@@ -55,6 +55,7 @@ from sim_server.backends.base import Launch
 from sim_server.backends.energies import ElementEnergies
 from sim_server.effects._base import Effect, PerBody
 from sim_server.errors import InputError
+from sim_server.mechanics.removal import present
 from sim_server.mechanics.system import Stencil, System
 from sim_server.mechanics.world import Body, World
 from sim_server.mesh.shape_functions import shape_gradients
@@ -65,6 +66,7 @@ from sim_server.scene.parameters import complaint
 from sim_server.scene.regions import Poisson, Regional, Young, region_values
 
 SCOPE = "object"
+REMOVED = 1e-20  # of its stiffness, which a removed element keeps, since kernels divide by mu
 
 
 class Params(Regional):
@@ -133,9 +135,10 @@ class Corotational(Effect):
             young, poisson = np.concatenate([*self.elastic_in(scene).values()], axis=1)[:, order]
             lam = young * poisson / ((1 + poisson) * (1 - 2 * poisson))
             mu = young / (2 * (1 + poisson))
-            return np.stack([lam * volume, mu * volume])
+            here = present(scene, self.rotated)[order]
+            return np.stack([lam * volume * here, mu * volume * np.where(here > 0, 1, REMOVED)])
 
-        self.lame = world.follow("corotational", compute=lame)
+        self.lame = world.follow("corotational", "cutting", compute=lame)
         owner = np.repeat([body.index for body, _ in listed], [len(body.mesh.tets) for body, _ in listed])
         self.owner = owner[order]
         m = len(self.elements)
@@ -144,6 +147,10 @@ class Corotational(Effect):
         self.near = np.zeros((m, 4))  # quaternions of `forces`, begun at those of its last state
         self.twist = np.zeros((m if self.variant == "_exact" else 0, 6))
         self._energy = np.zeros(m)
+
+    @property
+    def cuttable(self) -> bool:
+        return True
 
     def elastic_in(self, scene: Scene) -> Mapping[int, tuple[Float64, Float64]]:
         return {body.index: found for body, found in zip(self.rotated, self._constants(scene), strict=True)}

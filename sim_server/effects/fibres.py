@@ -82,6 +82,10 @@ class Fibres(Tetrahedra):
         self.constants = self.packed(LAW)
         self.directions = world.follow(LAW.name, compute=self._directions)
 
+    @property
+    def cuttable(self) -> bool:
+        return True
+
     def _directions(self, scene: Scene) -> Float64:
         directions = np.concatenate([v["direction"].reshape(-1, 2, 3) for v in self.values_in(scene, LAW)])[self.order]
         length = np.linalg.norm(directions, axis=2, keepdims=True)

@@ -41,6 +41,10 @@ class Gravity(Effect):
         world.gravity_of = _gravity_of
         self.g = world.gravity()
 
+    @property
+    def cuttable(self) -> bool:
+        return True
+
     def launches(self, system: System, stencil: Stencil | None, accumulate: bool) -> list[Launch]:
         w = self.world
         return [

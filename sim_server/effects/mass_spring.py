@@ -39,6 +39,7 @@ from sim_server.backends.base import Launch
 from sim_server.backends.energies import ElementEnergies
 from sim_server.effects._base import Effect, PerBody, params_in
 from sim_server.errors import InputError
+from sim_server.mechanics.removal import removed_from
 from sim_server.mechanics.system import Stencil, System
 from sim_server.mechanics.world import Body, World
 from sim_server.mesh.surface import EDGES
@@ -125,7 +126,11 @@ class MassSpring(Effect):
         def now(scene: Scene, part: int) -> Float64:
             return np.asarray(np.concatenate([found[part] for found in springs(scene)])[order])
 
-        self.stiffness = world.follow("mass_spring", compute=lambda scene: now(scene, 1))
+        def stiffness(scene: Scene) -> Float64:
+            found = zip(self.bodies, springs(scene), strict=True)
+            return np.asarray(np.concatenate([_stiffness_left(scene, b, each[1]) for b, each in found])[order])
+
+        self.stiffness = world.follow("mass_spring", "cutting", compute=stiffness)
         self.length = world.follow("mass_spring", compute=lambda scene: now(scene, 2))
         owner = np.repeat([body.index for body, _ in listed], [len(part[0]) for part in parts])
         self.owner = owner[order]
@@ -136,6 +141,11 @@ class MassSpring(Effect):
     def known_to_workers(self) -> bool:
         """False if springs come from files, which workers do not read."""
         return not self._from_files
+
+    @property
+    def cuttable(self) -> bool:
+        """True if all springs are those of edges, which elements have a part in."""
+        return all(body.effects["mass_spring"].springs is None for body in self.bodies)
 
     def elastic_in(self, scene: Scene) -> Mapping[int, tuple[Float64, Float64]]:
         given = zip(self.bodies, params_in(scene, "mass_spring", self.bodies), strict=True)
@@ -184,6 +194,16 @@ def _pairs(body: Body, params: Params) -> Int64 | None:
         return _pairs_of(params.springs) if isinstance(params.springs, str) else np.array(params.springs, np.int64)
     except InputError as error:
         raise InputError(f"object {body.name!r}, effect mass_spring: {error}") from error
+
+
+def _stiffness_left(scene: Scene, body: Body, stiffness: Float64) -> Float64:
+    """Returns the stiffness of a body's springs [N/m] without the elements that were removed."""
+    removed = removed_from(scene, body)
+    if not len(removed):
+        return stiffness
+    young = _young(body, scene.objects[body.index].effects["mass_spring"])  # type: ignore[arg-type]
+    young[removed] = 0
+    return edge_springs(body.mesh.rest, body.mesh.tets, young)[1]
 
 
 def _springs(body: Body, params: Params, pairs: Int64 | None) -> tuple[Int32, Float64, Float64]:

@@ -67,6 +67,10 @@ class Drag(Effect):
             found |= {(b.index, "stiffness"): "the stable step of an explicit scheme knows it" for b in self.bodies}
         return found
 
+    @property
+    def cuttable(self) -> bool:
+        return True
+
     def launches(self, system: System, stencil: Stencil | None, accumulate: bool) -> list[Launch]:
         w = self.world
         if not self.alpha.any() or w.explicit:  # an explicit scheme damps by world.alpha

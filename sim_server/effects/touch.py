@@ -114,6 +114,10 @@ class Touch(Effect):
         self.force, self.spring, self.anchor = np.zeros_like(world.x), np.zeros(world.nodes), np.zeros_like(world.x)
         world.backend.keep(self.force, self.spring, self.anchor)
 
+    @property
+    def cuttable(self) -> bool:
+        return True
+
     def launches(self, system: System, stencil: Stencil | None, accumulate: bool) -> list[Launch]:
         self._system = system
         return [self._bind([])]

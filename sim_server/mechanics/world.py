@@ -166,6 +166,11 @@ class World:
         self.live_arrays.append(LiveArray(array, of, compute))
         return array
 
+    def follow_into(self, array: NDArray[Any], *of: str, compute: Callable[[Scene], NDArray[Any]]) -> None:
+        """Has an array that there is follow parameters, as `follow` does for a new one."""
+        array[...] = compute(self._scene)
+        self.live_arrays.append(LiveArray(array, of, compute))
+
     @contextmanager
     def made_with(self, force_coefficient: float, dx_dv: float, usual_tangent: bool) -> Iterator[None]:
         """Launches made inside have these coefficients [s], and usual_tangent; their forces balance at the end."""

@@ -57,6 +57,8 @@ def keeps_mid_nodes(o: HasElements, integrator: IntegratorOptions) -> bool:
 
 def _reason(elements: Elements, effects: Mapping[str, Any], integrator: IntegratorOptions) -> str:
     """Returns why an object cannot have such elements, other than linear ones; empty if it may."""
+    if "cutting" in effects:
+        return 'with the effect cutting, which removes linear elements alone; allowed: "auto", "linear"'
     laws = [name for name in LAWS if name in effects]
     if linear := [name for name in laws if name not in PATCHED]:
         return f'with the effect {linear[0]}, which has linear elements alone; allowed: "auto", "linear"'

@@ -21,12 +21,14 @@ class Live:
     """Bounds of a slider, for what is sensible; the field itself says what is allowed.
 
     relative: they are factors of the value at the start. Equal bounds: the parameter has no slider.
+    listed: False for what clients change by a command of its own, and are not shown among parameters
     """
 
     low: float = 0.0
     high: float = 0.0
     logarithmic: bool = False
     relative: bool = False
+    listed: bool = True
 
 
 STIFFNESS = Live(0.01, 100, logarithmic=True, relative=True)

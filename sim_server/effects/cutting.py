@@ -1,0 +1,111 @@
+# SPDX-License-Identifier: MIT
+"""Elements that are taken out of an object while it moves: by a blade, in a sphere, in a region, or by their numbers.
+
+What is removed has no stiffness, no mass and no surface from one step to the next: all constants of the element are 0,
+and its nodes lose its part of their masses. What an element's removal opens becomes surface. Pieces that come apart
+move on their own, and stay one object. A node that has no element left rests where it was, out of everything.
+
+The pattern of A stays, with zeros in it, so that nothing of a step depends on how much was cut, and factors of matrices
+from before a cut stay in use: their rows of nodes without elements are set apart, and on the nodes that lost elements
+since the factor's matrix, T, they get a direct solve before and after (a symmetric multiplicative Schwarz method) ::
+
+    z1 = S r,   z2 = z1 + P (r - A z1),   z = z2 + S (r - A z2),   S = A_TT^-1 on T, 0 elsewhere
+
+The momentum of what stays is that before the cut. Cuts follow the elements, so edges are as rough as the mesh is coarse.
+
+`removed` is what the scene begins with, and a live parameter: clients cut by `sim-client cut`, which sets it; so cuts
+are logged, replayed, kept by checkpoints, and taken back by a reset.
+
+Source: Cotin, Delingette and Ayache, A hybrid elastic model for real-time cutting, deformations and force feedback,
+2000 (removal); Smith, Bjorstad and Gropp, Domain Decomposition, 1996, section 1.3 (Schwarz).
+"""
+
+from collections.abc import Mapping
+from typing import Annotated, Any
+
+import numpy as np
+from pydantic import AfterValidator, Field
+
+from sim_server.backends.base import Launch
+from sim_server.effects._base import Effect
+from sim_server.errors import InputError
+from sim_server.mechanics.removal import masses_left, numbers_of, present_nodes
+from sim_server.mechanics.system import Stencil, System
+from sim_server.mechanics.world import Body, World
+from sim_server.scene.live import Live
+from sim_server.scene.parameters import Parameters, complaint
+
+SCOPE = "object"
+
+
+def _numbers(text: str) -> str:
+    try:
+        numbers_of(text)
+    except ValueError as error:
+        raise complaint(str(error)) from None
+    return text
+
+
+class Params(Parameters):
+    removed: Annotated[str, AfterValidator(_numbers), Live(listed=False)] = Field(
+        default="", description='elements that are not there, by their numbers in the mesh from 0, such as "3 7-9 12"'
+    )
+
+
+class Cutting(Effect):
+    """Removed elements of all bodies that list the effect.
+
+    left (n,): part of each node's elements that is there; out (n,): 1 at nodes without any that were put to rest;
+    lost (n,): time at which a node last lost an element [s], -1: never
+    """
+
+    def __init__(self, world: World, listed: list[tuple[Body, Any]]):
+        self.world, self.bodies = world, [body for body, _ in listed]
+        if not world.inertia:
+            raise InputError(
+                f"object {self.bodies[0].name!r}, effect cutting: pieces that come apart need inertia, which the scheme "
+                "quasi_static leaves out"
+            )
+        masses = world.mass.copy()
+        world.follow_into(world.mass, "cutting", compute=lambda scene: masses_left(scene, world, masses))
+        self.left = world.follow("cutting", compute=lambda scene: present_nodes(scene, world))
+        self.known, self.out, self.lost = self.left.copy(), np.zeros(world.nodes), np.full(world.nodes, -1.0)
+        world.backend.keep(self.left, self.known, self.out, self.lost)
+
+    def check(self, effects: Mapping[str, Effect]) -> None:
+        """Raises InputError where another effect would go on as if nothing had been removed."""
+        w = self.world
+        for body in self.bodies:
+            if wrong := [n for n in body.effects if n in effects and n != "fixed" and not effects[n].cuttable]:
+                raise self._refusal(body, f"elements cannot be removed with the effect {wrong[0]}")
+            tied = {a.object for a in w.attachments} | {a.to for a in w.attachments}
+            if body.name in tied | {end.object for s in w.springs for end in s.between}:
+                raise self._refusal(body, "an object with attachments or springs cannot be cut")
+        if "contact" in effects and not effects["contact"].cuttable:
+            raise self._refusal(
+                self.bodies[0], "objects that are cut touch obstacles alone: contact = { between = false }, self = false"
+            )
+
+    def _refusal(self, body: Body, why: str) -> InputError:
+        return InputError(f"object {body.name!r}, effect cutting: {why}")
+
+    @property
+    def cuttable(self) -> bool:
+        return True
+
+    @property
+    def comes_first(self) -> bool:
+        return True
+
+    def launches(self, system: System, stencil: Stencil | None, accumulate: bool) -> list[Launch]:
+        w = self.world
+        settle: Launch = w.backend.module("effects/cutting.cu").bind(
+            "settle", w.nodes, left=self.left, clock=system.clock, known=self.known, out=self.out, lost=self.lost,
+            free=w.free, v=w.v, predictor=w.predictor,
+        )  # fmt: skip
+        return [settle]
+
+
+def build(world: World, listed: list[tuple[Body, Any]]) -> Cutting:
+    """Removes what the scene begins without. Raises InputError for numbers of elements that there are not."""
+    return Cutting(world, listed)

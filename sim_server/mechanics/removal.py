@@ -1,0 +1,92 @@
+# SPDX-License-Identifier: MIT
+"""Elements that were removed from an object, as the scene and its parameters name them, and what is left without them."""
+
+import re
+from collections.abc import Sequence
+from functools import lru_cache
+
+import numpy as np
+
+from sim_server.arrays import Float64, Int64
+from sim_server.errors import InputError
+from sim_server.mechanics.world import Body, World
+from sim_server.mesh.surface import volumes
+from sim_server.scene import Scene
+
+NUMBERS = re.compile(r"\s*(\d{1,9})(?:-(\d{1,9}))?(?:\s+|$)")
+LEAST_MASS = 1e-6  # of its own, which a node without elements keeps, since equations divide by it
+
+
+def numbers_of(text: str) -> Int64:
+    """Returns the numbers of a text such as "3 7-9 12", ascending and once each. Raises ValueError."""
+    return _numbers_of(text).copy()
+
+
+@lru_cache(maxsize=64)
+def _numbers_of(text: str) -> Int64:
+    at, ranges = 0, []
+    while at < len(text):
+        found = NUMBERS.match(text, at)
+        if found is None:
+            raise ValueError(f'{text[at : at + 20]!r} is no list of element numbers and ranges such as "3 7-9 12"')
+        first, last = int(found[1]), int(found[2] or found[1])
+        if last < first or last - first > 10_000_000:
+            raise ValueError(f"{found[0].strip()!r} is no range of element numbers, from a lower to a higher one")
+        ranges.append(np.arange(first, last + 1))
+        at = found.end()
+    return np.unique(np.concatenate([np.zeros(0, np.int64), *ranges]))
+
+
+def text_of(numbers: Sequence[int] | Int64) -> str:
+    """Returns numbers as a text of ranges, from which `numbers_of` reads them."""
+    found = np.unique(np.asarray(numbers, np.int64))
+    if not len(found):
+        return ""
+    first = np.flatnonzero(np.diff(found, prepend=found[0] - 2) > 1)
+    last = np.append(first[1:], len(found)) - 1
+    ends = zip(found[first].tolist(), found[last].tolist(), strict=True)
+    return " ".join(str(a) if a == b else f"{a}-{b}" for a, b in ends)
+
+
+def removed_from(scene: Scene, body: Body) -> Int64:
+    """Returns the numbers of the elements that a scene has removed from an object. Raises InputError."""
+    params = scene.objects[body.index].effects.get("cutting")
+    if params is None:
+        return np.zeros(0, np.int64)
+    removed = _numbers_of(params.removed)  # type: ignore[attr-defined]
+    if len(removed) and removed[-1] >= len(body.mesh.tets):
+        raise InputError(
+            f"object {body.name!r}, effect cutting: removed has element {removed[-1]}; it has {len(body.mesh.tets)}"
+        )
+    return removed
+
+
+def present(scene: Scene, bodies: Sequence[Body]) -> Float64:
+    """Returns 1 for each element of these bodies, one after another, 0 for those that the scene has removed."""
+    parts = [np.ones(len(body.mesh.tets)) for body in bodies]
+    for body, part in zip(bodies, parts, strict=True):
+        part[removed_from(scene, body)] = 0
+    return np.concatenate(parts)
+
+
+def present_nodes(scene: Scene, world: World) -> Float64:
+    """Returns the part of each node's elements that is left by volume, (nodes,): 1 where none was removed, 0 if all."""
+    out = np.ones(world.nodes)
+    for body in world.bodies:
+        removed = removed_from(scene, body)
+        if len(removed):
+            size = volumes(body.mesh.rest, body.mesh.tets)
+            gone = np.zeros(len(size))
+            gone[removed] = size[removed]
+            n, corners = body.last - body.first, body.mesh.tets.ravel()
+            whole = np.bincount(corners, weights=np.repeat(size, 4), minlength=n)
+            left = np.bincount(corners[np.repeat(gone == 0, 4)], minlength=n)
+            lost = np.bincount(corners, weights=np.repeat(gone, 4), minlength=n)
+            out[body.nodes] = np.where(left > 0, 1 - lost / np.where(whole > 0, whole, 1), 0)
+    return out
+
+
+def masses_left(scene: Scene, world: World, masses: Float64) -> Float64:
+    """Returns the nodal masses without the removed elements [kg]. masses (nodes,): with all of them."""
+    part = present_nodes(scene, world)
+    return np.where(part > 0, part, LEAST_MASS) * masses
