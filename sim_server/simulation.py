@@ -126,6 +126,7 @@ class Simulation:
         return EngineInput(
             assemble, integrate, names, ranges, w.dt, self.scene.solver, self.energies, newton, stages, euler, substeps,
             contact, touch, held, self.scene.accuracy is not None, arrays,
+            self.cutting.cut_input() if self.cutting else None,
         )  # fmt: skip
 
     @classmethod
@@ -247,6 +248,11 @@ class Simulation:
     def touch(self) -> "Touch | None":
         """Pushes and grabs, if the scene lists them."""
         return cast("Touch | None", self.effects.get("touch"))
+
+    @property
+    def cutting(self) -> "Cutting | None":
+        """Elements that are removed, if the scene lists it."""
+        return cast("Cutting | None", self.effects.get("cutting"))
 
     @property
     def contact(self) -> "Contact | None":

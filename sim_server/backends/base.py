@@ -335,6 +335,7 @@ class EngineInput:
     held: (bodies, k, 6) force [N] and torque [N m] on each holder, attachment and spring; None: there are none
     errors: whether the estimated errors of positions are wanted where they cost time
     arrays: of the system by name: row_start, columns, values, b, y, x, v, clock, moving, rotation
+    cut: of bodies that may lose elements; None: no object lists the effect
     """
 
     assemble: Sequence[Launch]
@@ -353,6 +354,20 @@ class EngineInput:
     held: Float64 | None
     errors: bool
     arrays: Mapping[str, NDArray[Any]]
+    cut: "CutInput | None" = None
+
+
+@dataclass(frozen=True)
+class CutInput:
+    """What tells engines which nodes of bodies lost elements, and when.
+
+    bodies: indices of those that may; at_rest, changed_at, free (nodes,): as in effects/cutting.py
+    """
+
+    bodies: Sequence[int]
+    at_rest: Float64
+    changed_at: Float64
+    free: Float64
 
 
 class Backend(Protocol):

@@ -26,7 +26,7 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import AfterValidator, Field
 
-from sim_server.backends.base import Launch
+from sim_server.backends.base import CutInput, Launch
 from sim_server.effects._base import Effect
 from sim_server.errors import InputError
 from sim_server.mechanics.removal import masses_left, numbers_of, present_nodes
@@ -55,8 +55,8 @@ class Params(Parameters):
 class Cutting(Effect):
     """Removed elements of all bodies that list the effect.
 
-    left (n,): part of each node's elements that is there; out (n,): 1 at nodes without any that were put to rest;
-    lost (n,): time at which a node last lost an element [s], -1: never
+    left (n,): part of each node's elements that is there; at_rest (n,): 1 at free nodes without any; changed_at (n,):
+    time at which a node last lost or got back an element [s], -1: never
     """
 
     def __init__(self, world: World, listed: list[tuple[Body, Any]]):
@@ -66,11 +66,12 @@ class Cutting(Effect):
                 f"object {self.bodies[0].name!r}, effect cutting: pieces that come apart need inertia, which the scheme "
                 "quasi_static leaves out"
             )
-        masses = world.mass.copy()
+        n, masses = world.nodes, world.mass.copy()
         world.follow_into(world.mass, "cutting", compute=lambda scene: masses_left(scene, world, masses))
         self.left = world.follow("cutting", compute=lambda scene: present_nodes(scene, world))
-        self.known, self.out, self.lost = self.left.copy(), np.zeros(world.nodes), np.full(world.nodes, -1.0)
-        world.backend.keep(self.left, self.known, self.out, self.lost)
+        self._before, self.at_rest, self.changed_at = self.left.copy(), np.zeros(n), np.full(n, -1.0)
+        world.backend.keep(self._before, self.at_rest)
+        world.backend.keep(self.changed_at, exact=True)
 
     def check(self, effects: Mapping[str, Effect]) -> None:
         """Raises InputError where another effect would go on as if nothing had been removed."""
@@ -97,11 +98,15 @@ class Cutting(Effect):
     def comes_first(self) -> bool:
         return True
 
+    def cut_input(self) -> CutInput:
+        """Returns what keeps factors useful that were made before a cut."""
+        return CutInput([body.index for body in self.bodies], self.at_rest, self.changed_at, self.world.free)
+
     def launches(self, system: System, stencil: Stencil | None, accumulate: bool) -> list[Launch]:
         w = self.world
         settle: Launch = w.backend.module("effects/cutting.cu").bind(
-            "settle", w.nodes, left=self.left, clock=system.clock, known=self.known, out=self.out, lost=self.lost,
-            free=w.free, v=w.v, predictor=w.predictor,
+            "settle", w.nodes, left=self.left, clock=system.clock, left_before=self._before,
+            changed_at=self.changed_at, at_rest=self.at_rest, free=w.free, v=w.v, predictor=w.predictor,
         )  # fmt: skip
         return [settle]
 

@@ -22,7 +22,9 @@ DERIVED = frozenset({
     "sums", "b", "diagonal", "mean", "b_material", "y", "values", "block",  # of the system
     "pull",  # of pushes and grabs
 })  # fmt: skip
-TOTALS = frozenset({"refused", "dropped"})  # counted or first times of a run, which no reset takes back
+TOTALS = frozenset({  # counted or first times of a run, or what factors have to know: no reset takes it back
+    "refused", "dropped", "left_before", "changed_at", "at_rest",
+})  # fmt: skip
 
 
 def state_arrays(simulation: Simulation) -> list[StateArray]:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from protocol.factor import FactorPattern
 from sim_server.arrays import Int32
-from sim_server.backends.base import ArrayChange, Capability, EngineInput, Launch
+from sim_server.backends.base import ArrayChange, Capability, CutInput, EngineInput, Launch
 from sim_server.backends.central_difference import NODAL as NODAL_OF_SUBSTEPS
 from sim_server.backends.central_difference import CentralDifference
 from sim_server.backends.compiler import native
@@ -396,6 +396,29 @@ class _NativeContact:
         native.body = c.addressof(self._references)
 
 
+WIDEST_CUT = 30 * 9  # as ENOUGH_FOR_CUTS of native/cut_nodes.h, in numbers of A a block
+
+
+class _NativeCut:
+    """Nodes of a body that may lose elements, and room for a direct solve on those that did."""
+
+    def __init__(self, given: CutInput, body: Any, dt: float, arrays: Mapping[str, NDArray[Any]]):
+        n = body.last - body.first
+        blocks = int(arrays["row_start"][body.last] - arrays["row_start"][body.first])
+        capacity = int((WIDEST_CUT * blocks * 3 * n) ** 0.5)  # rows of these widths have no more entries
+        room: dict[str, NDArray[Any]] = {
+            "node": np.zeros(n, np.int32), "place": np.zeros(n, np.int32), "first": np.zeros(3 * n, np.int32),
+            "row": np.zeros(3 * n, np.int64), "envelope": np.zeros(capacity), "t": np.zeros(3 * n),
+            "room": np.zeros(3 * n),
+        }  # fmt: skip
+        room |= {name: getattr(given, name)[body.first : body.last] for name in ("at_rest", "changed_at", "free")}
+        self._room = room
+        self.native = structs.CutNodes(nodes=n, capacity=capacity, dt=dt)
+        for name, array in room.items():
+            setattr(self.native, name, array.ctypes.data)
+        body.correction.cut = c.addressof(self.native)
+
+
 def _binding(launch: CpuLaunch) -> structs.Binding:
     """Arguments of a launch that the loop has not taken up yet."""
     return structs.Binding(params=c.addressof(launch.params), items=launch.items, taken=-1)
@@ -449,6 +472,8 @@ class CpuEngine(Reports):
             self._contact.native.predictor = given.euler.start_v.ctypes.data
         elif self._contact and self._newton:
             self._contact.native.predictor = self._newton.search_in_contact(bodies).ctypes.data
+        self._cut = [_NativeCut(given.cut, self._body[index], given.dt, arrays) for index in
+                     (given.cut.bodies if given.cut and given.solver.wants_factors else ())]  # fmt: skip
         obstacles = len(given.contact.obstacles.kind) if given.contact else 0
         if given.held is not None:
             loop.holders, loop.held_reaction = given.held.shape[1], given.held.ctypes.data
@@ -541,6 +566,8 @@ class CpuEngine(Reports):
     def resume(self, step: int, start_time: float) -> None:
         """Goes on from a state that was written, after `step` steps."""
         self.loop.step, self.loop.start_time, self._begun = step, start_time, True
+        for cut in self._cut:
+            cut.native.start_time = start_time
         for entry in self._body:
             entry.steps = step
         self._energies.resume(self._arrays["x"], self._arrays["v"])

@@ -58,6 +58,11 @@ class Launch(c.Structure):
 
 
 @LOOP.struct
+class CutNodes(c.Structure):
+    """Nodes of a body that may lose elements."""
+
+
+@LOOP.struct
 class Correction(c.Structure):
     """Low-rank correction of a factor."""
 

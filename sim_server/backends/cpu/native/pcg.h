@@ -68,9 +68,10 @@ struct Preconditioner {
     void* work;       // 2 n doubles
     double omega;
     Correction* correction = nullptr;
-    bool corrects = false;
+    bool corrects = false, cut = false;
 
     void prepare() {
+        cut = kind == CHOLESKY && correction && correction->cut && is_cut();
         corrects = kind == CHOLESKY && correction && correction->capacity && Corrected{*correction, A, *factor}.prepare();
         if (kind == JACOBI || kind == BLOCK_JACOBI || kind == SSOR) invert_diagonal(A, kind != JACOBI, inverse);
     }
@@ -89,8 +90,18 @@ struct Preconditioner {
             apply_diagonal(n / 3, inverse, r, z);
         return dot(n, z, r);
     }
+    bool is_cut() {
+        CutSolve around{*correction->cut, A};
+        around.prepare(factor->step);
+        return around.works();
+    }
     template <class T>
     void with_factor(const double* r, double r_norm, double* z) {
+        if (!cut) return apply_alone<T>(r, r_norm, z);
+        CutSolve{*correction->cut, A}.around(r, z, [&](const double* from, double* to) { apply_alone<T>(from, r_norm, to); });
+    }
+    template <class T>
+    void apply_alone(const double* r, double r_norm, double* z) {
         const T* values = (const T*)factor->values;
         auto correct = [&](T* y) { Corrected{*correction, A, *factor}.between(y); };
         if (corrects) apply_factor(*factor->pattern, values, r, 1 / r_norm, z, (T*)work, correct);

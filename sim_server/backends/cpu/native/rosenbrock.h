@@ -47,6 +47,14 @@ static void choose_form(Loop& loop, int index, bool whole) {
     s.assembled = whole || s.form == ITERATE || copy_wanted(body);
 }
 
+// True if elements were removed since the matrix of the body's factor.
+static bool is_cut_since(const Body& body) {
+    const CutNodes* cut = body.correction.cut;
+    for (int i = 0; cut && i < cut->nodes; ++i)
+        if (cut->changed_at[i] > cut->start_time + (body.factor->step + 0.5) * cut->dt) return true;
+    return false;
+}
+
 // After the forces of the first stage are evaluated: whether factors know the springs of grabs, or are corrected for them. Where one
 // does not, the body iterates in this step, and so does one whose holder moves: the check of its factor knows nothing of that.
 static void check_corrections(Loop& loop) {
@@ -56,7 +64,7 @@ static void check_corrections(Loop& loop) {
         Body& body = loop.body[i];
         s.corrects = s.misses = false;
         if (s.form != FACTOR) continue;
-        s.misses = loop.stages->held_moves[i];
+        s.misses = loop.stages->held_moves[i] || is_cut_since(body);
         if (!s.misses && body.correction.capacity > 0) {
             s.corrects = Corrected{body.correction, matrix_of(loop, body), *body.factor}.prepare();
             s.misses = body.correction.missed;

@@ -18,6 +18,7 @@
 #include <cstdint>
 
 #include "bsr.h"
+#include "cut_nodes.h"
 #include "supernodal.h"
 
 struct Factor {
@@ -72,6 +73,7 @@ struct Correction {
     KnownContact* touch;    // (touches,) the ring
     double *touch_now, *touch_then;  // (nodes, 9) own blocks
     KnownContact *link_now, *link_then;  // blocks between two nodes
+    CutNodes* cut;          // nodes that may lose elements, or null
 };
 
 constexpr int MAX_CORRECTED = 64;              // nodes

@@ -1,0 +1,181 @@
+// SPDX-License-Identifier: MIT
+// Keeps a factor useful after elements were removed (effects/cutting.py). With T the nodes that lost or got back elements since the
+// factor's matrix, and S the inverse of A on T, the symmetric multiplicative Schwarz method
+//     z = S r + (I - S A) P^-1 (I - A S) r
+// is exact on T and positive definite if P is. Nodes without elements, whose rows of A are the identity, are set apart: z = 0 there.
+// S is a Cholesky factor with an envelope, in the order of Cuthill and McKee, made in each solve, since A changes. Where that costs
+// too much (ENOUGH_FOR_CUTS), T is left out and only the nodes without elements are set apart.
+// (Smith, Bjorstad and Gropp, Domain Decomposition, 1996, section 1.3; George and Liu, Computer Solution of Large Sparse Positive
+// Definite Systems, 1981, chapter 4.)
+#pragma once
+#include <algorithm>
+#include <cmath>
+#include <cstdint>
+
+#include "bsr.h"
+
+struct CutNodes {          // of a body whose elements may be removed
+    int32_t nodes;         // of the body
+    int32_t count;         // of T in the solve under way; 0: T is left out
+    int32_t wanted;        // of T, whether or not it is left out
+    int32_t gone;          // nodes without elements
+    int64_t capacity;      // entries of `envelope`
+    double start_time, dt; // of the run [s]
+    const double* at_rest;     // (nodes,) 1 at nodes without elements
+    const double* changed_at;  // (nodes,) when the node lost or got back an element [s]
+    const double* free;        // (nodes,) 0 at fixed nodes
+    int32_t *node, *place;     // (nodes,) T, in its order; place of each node in it, -1: not there
+    int32_t* first;            // (3 nodes,) first column of each row
+    int64_t* row;              // (3 nodes,) where the entry of column 0 of each row would be in `envelope`
+    double* envelope;          // (capacity,) lower triangle of the Cholesky factor, row after row
+    double *t, *room;          // (3 nodes,) on T; of the body
+};
+
+constexpr double ENOUGH_FOR_CUTS = 30;  // products with A that the factorization of S may cost
+
+// The Schwarz method around one factor; allocates nothing.
+struct CutSolve {
+    CutNodes& c;
+    const BlockCsr& A;
+
+    // Finds T and factorizes A on it. step: of the factor's matrix
+    void prepare(int64_t step) {
+        const double since = c.start_time + (step + 0.5) * c.dt;
+        c.count = c.wanted = c.gone = 0;
+        for (int i = 0; i < c.nodes; ++i) {
+            c.place[i] = -1;
+            if (c.at_rest[i] != 0) ++c.gone;
+            else if (c.changed_at[i] > since && c.free[i] != 0) c.place[i] = -2, ++c.wanted;
+        }
+        if (!c.wanted) return;
+        sort();
+        if (assemble() && factorize()) c.count = c.wanted;
+    }
+
+    bool works() const { return c.count > 0 || c.gone > 0; }
+
+    // z = S r + (I - S A) P^-1 (I - A S) r. apply(from, z): z = P^-1 from
+    template <class F> void around(const double* r, double* z, F apply) {
+        if (!c.count) {
+            apply(r, z);
+            set_apart(z);
+            return;
+        }
+        std::copy(r, r + 3 * c.nodes, c.room);
+        gather(r, c.t);
+        solve(c.t);
+        for (int k = 0; k < c.count; ++k) {  // (I - A S) r, by the columns of T
+            const double* t = c.t + 3 * k;
+            each_block(c.node[k], [&](int j, const double* a) {
+                for (int m = 0; m < 3; ++m) c.room[3 * j + m] -= a[m] * t[0] + a[3 + m] * t[1] + a[6 + m] * t[2];
+            });
+        }
+        apply(c.room, z);
+        set_apart(z);
+        double* s = c.room;
+        for (int k = 0; k < c.count; ++k) {  // A z on T
+            s[3 * k] = s[3 * k + 1] = s[3 * k + 2] = 0;
+            each_block(c.node[k], [&](int j, const double* a) {
+                for (int m = 0; m < 3; ++m) s[3 * k + m] += a[3 * m] * z[3 * j] + a[3 * m + 1] * z[3 * j + 1] + a[3 * m + 2] * z[3 * j + 2];
+            });
+        }
+        solve(s);
+        for (int k = 0; k < c.count; ++k)
+            for (int m = 0; m < 3; ++m) z[3 * c.node[k] + m] += c.t[3 * k + m] - s[3 * k + m];
+    }
+
+private:
+    // f(node of the body, block) of the blocks in a node's row of A.
+    template <class F> void each_block(int i, F f) const {
+        for (int64_t k = A.row_start[A.first + i]; k < A.row_start[A.first + i + 1]; ++k) f(A.columns[k] - A.first, A.values + 9 * k);
+    }
+
+    void set_apart(double* z) const {
+        for (int i = 0; c.gone && i < c.nodes; ++i)
+            if (c.at_rest[i] != 0) z[3 * i] = z[3 * i + 1] = z[3 * i + 2] = 0;
+    }
+
+    void gather(const double* from, double* t) const {
+        for (int k = 0; k < c.count; ++k)
+            for (int m = 0; m < 3; ++m) t[3 * k + m] = from[3 * c.node[k] + m];
+    }
+
+    // Numbers T part by part, neighbours after neighbours, and turns the order round.
+    void sort() {
+        int found = 0;
+        for (int i = 0; i < c.nodes; ++i) {
+            if (c.place[i] != -2) continue;
+            c.node[found] = i;
+            c.place[i] = found++;
+            for (int k = c.place[i]; k < found; ++k)
+                each_block(c.node[k], [&](int j, const double*) {
+                    if (c.place[j] == -2) c.node[found] = j, c.place[j] = found++;
+                });
+        }
+        std::reverse(c.node, c.node + found);
+        for (int k = 0; k < found; ++k) c.place[c.node[k]] = k;
+    }
+
+    // Copies A on T into the envelope; false if it is too large.
+    bool assemble() {
+        int64_t at = 0;
+        double work = 0;
+        for (int k = 0; k < c.wanted; ++k) {
+            int least = k;
+            each_block(c.node[k], [&](int j, const double*) { if (c.place[j] >= 0) least = std::min(least, c.place[j]); });
+            for (int m = 0; m < 3; ++m) {
+                c.first[3 * k + m] = 3 * least;
+                c.row[3 * k + m] = at - 3 * least;
+                at += 3 * (k - least) + m + 1;
+                work += (double)(3 * (k - least) + m + 1) * (3 * (k - least) + m + 1);
+            }
+        }
+        const double blocks = A.row_start[A.last] - A.row_start[A.first];
+        if (at > c.capacity || work > ENOUGH_FOR_CUTS * 9 * blocks) return false;
+        std::fill(c.envelope, c.envelope + at, 0);
+        for (int k = 0; k < c.wanted; ++k)
+            each_block(c.node[k], [&](int j, const double* a) {
+                const int p = c.place[j];
+                if (p < 0 || p > k) return;
+                for (int m = 0; m < 3; ++m)
+                    for (int l = 0; l < 3 && 3 * p + l <= 3 * k + m; ++l) c.envelope[c.row[3 * k + m] + 3 * p + l] = a[3 * m + l];
+            });
+        return true;
+    }
+
+    static double product(const double* a, const double* b, int n) {
+        double s = 0;
+#pragma omp simd reduction(+ : s)
+        for (int i = 0; i < n; ++i) s += a[i] * b[i];
+        return s;
+    }
+
+    // In place; false if A is not positive definite there.
+    bool factorize() {
+        for (int i = 0; i < 3 * c.wanted; ++i) {
+            double* own = c.envelope + c.row[i];
+            for (int j = c.first[i]; j <= i; ++j) {
+                const double* other = c.envelope + c.row[j];
+                const int from = std::max(c.first[i], c.first[j]);
+                const double s = own[j] - product(own + from, other + from, j - from);
+                if (j < i) own[j] = s / other[j];
+                else if (!(s > 0)) return false;
+                else own[i] = std::sqrt(s);
+            }
+        }
+        return true;
+    }
+
+    void solve(double* t) const {
+        const int n = 3 * c.count;
+        for (int i = 0; i < n; ++i) {
+            const double* own = c.envelope + c.row[i];
+            t[i] = (t[i] - product(own + c.first[i], t + c.first[i], i - c.first[i])) / own[i];
+        }
+        for (int i = n; i-- > 0;) {
+            const double *own = c.envelope + c.row[i], x = t[i] /= own[i];
+#pragma omp simd
+            for (int j = c.first[i]; j < i; ++j) t[j] -= own[j] * x;
+        }
+    }
+};
