@@ -280,6 +280,44 @@ def move_obstacle(
 
 
 @app.command()
+def cut(
+    object: Object,
+    blade: Annotated[
+        list[Triple] | None,
+        typer.Option(metavar="X Y Z", help="Corner of the surface that a blade sweeps, m; 3 or 4 times."),
+    ] = None,
+    sphere: Annotated[
+        tuple[float, float, float, float] | None,
+        typer.Option(metavar="X Y Z R", help="Takes the elements with centroids in it, m."),
+    ] = None,
+    where: Annotated[str, typer.Option(metavar="EXPRESSION", help="In X, Y, Z of centroids at rest.")] = "",
+    elements: Annotated[str, typer.Option(metavar="NUMBERS", help='Of the mesh, from 0, as "3 7-9 12".')] = "",
+    as_json: Json = False,
+    connect: Connect = None,
+    server: Server = SERVER_NAME,
+) -> None:
+    """Remove elements of an object that lists the effect cutting: what a blade meets, a sphere, a region, by number.
+
+    A blade and a sphere are where the object is now. `sim-client reset` puts all back.
+
+    \b
+    Examples:
+      sim-client cut --object liver --blade 0 0 0 --blade 0.1 0 0 --blade 0.1 0.1 0 --blade 0 0.1 0
+      sim-client cut --object beam --sphere 0.5 0.5 4 0.3
+      sim-client cut --object beam --where "abs(Z - 2) < 0.1 and Y > 0.5"
+    """
+    from clients.client import Client
+
+    center, radius = (sphere[:3], sphere[3]) if sphere else (None, 0.0)
+    with Client(server, connect) as client:
+        reply = client.cut(object, blade=blade, center=center, radius=radius, where=where, elements=elements)
+    if as_json:
+        print(json.dumps({"removed": reply.removed, "left": reply.left}))
+    else:
+        print(f"{reply.removed} elements removed, {reply.left} left")
+
+
+@app.command()
 def haptics(
     name: Annotated[str, typer.Argument(metavar="NAME", help='Obstacle of the scene with moved = "client".')],
     press: Annotated[Triple, typer.Option(metavar="X Y Z", help="How far the hand goes from where it is, m.")],

@@ -172,6 +172,24 @@ class Client:
             wanted.target.CopyFrom(vector(at if target is None else target, "target"))  # type: ignore[arg-type]
         return Grab(self, self.command("grab", wanted).interaction)
 
+    def cut(
+        self, object: str, *, blade: Sequence[Point] | None = None, center: Point | None = None, radius: float = 0.0,
+        where: str = "", elements: str = "",
+    ) -> pb.Reply:  # fmt: skip
+        """Removes elements of an object that lists the effect cutting; the reply has how many, and how many are left.
+
+        blade: 3 or 4 corners of the surface that a blade sweeps [m]: elements that it meets now. center, radius: those
+        with centroids in this sphere now [m]. where: expression in X, Y, Z at rest. elements: numbers, as "3 7-9 12".
+        Raises BadInput.
+
+        >>> client.cut("liver", blade=[(0, 0, 0), (0.1, 0, 0), (0.1, 0.1, 0), (0, 0.1, 0)])
+        """
+        wanted = pb.Cut(object=object, radius=number(radius, "radius"), where=where, elements=elements)
+        wanted.blade.extend(vector(corner, "blade") for corner in blade or ())
+        if center is not None:
+            wanted.center.CopyFrom(vector(center, "center"))
+        return self.command("cut", cut=wanted)
+
     @overload
     def set(self, key: str, value: Value) -> list[pb.LiveParameter]: ...
     @overload

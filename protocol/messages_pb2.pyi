@@ -94,7 +94,7 @@ class Scene(_message.Message):
     def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., name: _Optional[str] = ..., toml: _Optional[str] = ..., resolved: _Optional[str] = ..., dt: _Optional[float] = ..., started_ns: _Optional[int] = ..., software: _Optional[str] = ..., objects: _Optional[_Iterable[str]] = ..., server: _Optional[str] = ..., device: _Optional[str] = ..., build: _Optional[str] = ..., obstacles: _Optional[_Iterable[str]] = ...) -> None: ...
 
 class Topology(_message.Message):
-    __slots__ = ("header", "nodes", "rest", "tets", "triangles", "row_start", "columns", "fixed", "young", "poisson", "reference", "skin_nodes", "skin_weights", "skin_triangles", "quadratic")
+    __slots__ = ("header", "nodes", "rest", "tets", "triangles", "row_start", "columns", "fixed", "young", "poisson", "reference", "skin_nodes", "skin_weights", "skin_triangles", "removed", "cut", "quadratic")
     HEADER_FIELD_NUMBER: _ClassVar[int]
     NODES_FIELD_NUMBER: _ClassVar[int]
     REST_FIELD_NUMBER: _ClassVar[int]
@@ -109,6 +109,8 @@ class Topology(_message.Message):
     SKIN_NODES_FIELD_NUMBER: _ClassVar[int]
     SKIN_WEIGHTS_FIELD_NUMBER: _ClassVar[int]
     SKIN_TRIANGLES_FIELD_NUMBER: _ClassVar[int]
+    REMOVED_FIELD_NUMBER: _ClassVar[int]
+    CUT_FIELD_NUMBER: _ClassVar[int]
     QUADRATIC_FIELD_NUMBER: _ClassVar[int]
     header: Header
     nodes: int
@@ -124,8 +126,10 @@ class Topology(_message.Message):
     skin_nodes: bytes
     skin_weights: bytes
     skin_triangles: bytes
+    removed: bytes
+    cut: int
     quadratic: bytes
-    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., nodes: _Optional[int] = ..., rest: _Optional[bytes] = ..., tets: _Optional[bytes] = ..., triangles: _Optional[bytes] = ..., row_start: _Optional[bytes] = ..., columns: _Optional[bytes] = ..., fixed: _Optional[bytes] = ..., young: _Optional[bytes] = ..., poisson: _Optional[bytes] = ..., reference: _Optional[bytes] = ..., skin_nodes: _Optional[bytes] = ..., skin_weights: _Optional[bytes] = ..., skin_triangles: _Optional[bytes] = ..., quadratic: _Optional[bytes] = ...) -> None: ...
+    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., nodes: _Optional[int] = ..., rest: _Optional[bytes] = ..., tets: _Optional[bytes] = ..., triangles: _Optional[bytes] = ..., row_start: _Optional[bytes] = ..., columns: _Optional[bytes] = ..., fixed: _Optional[bytes] = ..., young: _Optional[bytes] = ..., poisson: _Optional[bytes] = ..., reference: _Optional[bytes] = ..., skin_nodes: _Optional[bytes] = ..., skin_weights: _Optional[bytes] = ..., skin_triangles: _Optional[bytes] = ..., removed: _Optional[bytes] = ..., cut: _Optional[int] = ..., quadratic: _Optional[bytes] = ...) -> None: ...
 
 class Matrix(_message.Message):
     __slots__ = ("header", "step", "warp", "blocks", "checksum", "factor_dtype", "method", "known_patterns", "lease", "factor_slot", "matrix_slot", "worker", "drop_tolerance", "fill", "omega", "nodes")
@@ -370,20 +374,22 @@ class MoveTaken(_message.Message):
     def __init__(self, client: _Optional[str] = ..., obstacle: _Optional[str] = ..., grab: _Optional[int] = ..., move: _Optional[int] = ..., step: _Optional[int] = ...) -> None: ...
 
 class State(_message.Message):
-    __slots__ = ("header", "step", "time", "nodes", "x", "v")
+    __slots__ = ("header", "step", "time", "nodes", "x", "v", "cut")
     HEADER_FIELD_NUMBER: _ClassVar[int]
     STEP_FIELD_NUMBER: _ClassVar[int]
     TIME_FIELD_NUMBER: _ClassVar[int]
     NODES_FIELD_NUMBER: _ClassVar[int]
     X_FIELD_NUMBER: _ClassVar[int]
     V_FIELD_NUMBER: _ClassVar[int]
+    CUT_FIELD_NUMBER: _ClassVar[int]
     header: Header
     step: int
     time: float
     nodes: int
     x: bytes
     v: bytes
-    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., step: _Optional[int] = ..., time: _Optional[float] = ..., nodes: _Optional[int] = ..., x: _Optional[bytes] = ..., v: _Optional[bytes] = ...) -> None: ...
+    cut: int
+    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., step: _Optional[int] = ..., time: _Optional[float] = ..., nodes: _Optional[int] = ..., x: _Optional[bytes] = ..., v: _Optional[bytes] = ..., cut: _Optional[int] = ...) -> None: ...
 
 class Vector(_message.Message):
     __slots__ = ("x", "y", "z")
@@ -553,8 +559,24 @@ class FactorUse(_message.Message):
     later: bool
     def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., step: _Optional[int] = ..., pattern: _Optional[int] = ..., checksum: _Optional[int] = ..., dtype: _Optional[str] = ..., worker: _Optional[str] = ..., library: _Optional[str] = ..., threads: _Optional[int] = ..., seconds: _Optional[float] = ..., remedy: _Optional[str] = ..., method: _Optional[str] = ..., ahead: _Optional[float] = ..., later: _Optional[bool] = ...) -> None: ...
 
+class Cut(_message.Message):
+    __slots__ = ("object", "blade", "center", "radius", "where", "elements")
+    OBJECT_FIELD_NUMBER: _ClassVar[int]
+    BLADE_FIELD_NUMBER: _ClassVar[int]
+    CENTER_FIELD_NUMBER: _ClassVar[int]
+    RADIUS_FIELD_NUMBER: _ClassVar[int]
+    WHERE_FIELD_NUMBER: _ClassVar[int]
+    ELEMENTS_FIELD_NUMBER: _ClassVar[int]
+    object: str
+    blade: _containers.RepeatedCompositeFieldContainer[Vector]
+    center: Vector
+    radius: float
+    where: str
+    elements: str
+    def __init__(self, object: _Optional[str] = ..., blade: _Optional[_Iterable[_Union[Vector, _Mapping]]] = ..., center: _Optional[_Union[Vector, _Mapping]] = ..., radius: _Optional[float] = ..., where: _Optional[str] = ..., elements: _Optional[str] = ...) -> None: ...
+
 class Command(_message.Message):
-    __slots__ = ("header", "client", "verb", "interaction", "secret", "target", "parameters", "object", "steps", "worker")
+    __slots__ = ("header", "client", "verb", "interaction", "secret", "target", "parameters", "object", "steps", "worker", "cut")
     HEADER_FIELD_NUMBER: _ClassVar[int]
     CLIENT_FIELD_NUMBER: _ClassVar[int]
     VERB_FIELD_NUMBER: _ClassVar[int]
@@ -565,6 +587,7 @@ class Command(_message.Message):
     OBJECT_FIELD_NUMBER: _ClassVar[int]
     STEPS_FIELD_NUMBER: _ClassVar[int]
     WORKER_FIELD_NUMBER: _ClassVar[int]
+    CUT_FIELD_NUMBER: _ClassVar[int]
     header: Header
     client: str
     verb: str
@@ -575,10 +598,11 @@ class Command(_message.Message):
     object: str
     steps: int
     worker: str
-    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., client: _Optional[str] = ..., verb: _Optional[str] = ..., interaction: _Optional[_Union[Interaction, _Mapping]] = ..., secret: _Optional[bytes] = ..., target: _Optional[_Union[ObstacleTarget, _Mapping]] = ..., parameters: _Optional[_Iterable[_Union[Parameter, _Mapping]]] = ..., object: _Optional[str] = ..., steps: _Optional[int] = ..., worker: _Optional[str] = ...) -> None: ...
+    cut: Cut
+    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., client: _Optional[str] = ..., verb: _Optional[str] = ..., interaction: _Optional[_Union[Interaction, _Mapping]] = ..., secret: _Optional[bytes] = ..., target: _Optional[_Union[ObstacleTarget, _Mapping]] = ..., parameters: _Optional[_Iterable[_Union[Parameter, _Mapping]]] = ..., object: _Optional[str] = ..., steps: _Optional[int] = ..., worker: _Optional[str] = ..., cut: _Optional[_Union[Cut, _Mapping]] = ...) -> None: ...
 
 class Reply(_message.Message):
-    __slots__ = ("header", "error", "interaction", "status", "unchanged", "parameters", "worker")
+    __slots__ = ("header", "error", "interaction", "status", "unchanged", "parameters", "worker", "removed", "left")
     HEADER_FIELD_NUMBER: _ClassVar[int]
     ERROR_FIELD_NUMBER: _ClassVar[int]
     INTERACTION_FIELD_NUMBER: _ClassVar[int]
@@ -586,6 +610,8 @@ class Reply(_message.Message):
     UNCHANGED_FIELD_NUMBER: _ClassVar[int]
     PARAMETERS_FIELD_NUMBER: _ClassVar[int]
     WORKER_FIELD_NUMBER: _ClassVar[int]
+    REMOVED_FIELD_NUMBER: _ClassVar[int]
+    LEFT_FIELD_NUMBER: _ClassVar[int]
     header: Header
     error: str
     interaction: Interaction
@@ -593,7 +619,9 @@ class Reply(_message.Message):
     unchanged: bool
     parameters: _containers.RepeatedCompositeFieldContainer[LiveParameter]
     worker: str
-    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., error: _Optional[str] = ..., interaction: _Optional[_Union[Interaction, _Mapping]] = ..., status: _Optional[_Union[Status, _Mapping]] = ..., unchanged: _Optional[bool] = ..., parameters: _Optional[_Iterable[_Union[LiveParameter, _Mapping]]] = ..., worker: _Optional[str] = ...) -> None: ...
+    removed: int
+    left: int
+    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., error: _Optional[str] = ..., interaction: _Optional[_Union[Interaction, _Mapping]] = ..., status: _Optional[_Union[Status, _Mapping]] = ..., unchanged: _Optional[bool] = ..., parameters: _Optional[_Iterable[_Union[LiveParameter, _Mapping]]] = ..., worker: _Optional[str] = ..., removed: _Optional[int] = ..., left: _Optional[int] = ...) -> None: ...
 
 class Parameter(_message.Message):
     __slots__ = ("key", "value")

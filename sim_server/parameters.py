@@ -142,6 +142,12 @@ class LiveParameters:
             self._give(scene, changed, client)
         return [self._described(new[key]) for key in given]
 
+    def take_back(self, ending: str, objects: Sequence[str]) -> None:
+        """Sets the parameters of these objects whose keys end so to what they were at the start."""
+        keys = {f"object.{name}.effects{ending}" for name in objects} & self.changed.keys()
+        if keys:
+            self.set({key: toml(_plain(self._start[key])) for key in keys})
+
     def known_to_workers_at(self, step: int) -> bool:
         """True if the matrix assembled after `step` completed steps has the parameters of the start."""
         first = self._first

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,7 +36,10 @@ class Skin:
 
 @dataclass(frozen=True)
 class Mesh:
-    """One topology epoch of an object."""
+    """An object from one change of its mesh to the next: a topology epoch, or a part of it without what was cut.
+
+    epoch: grows with each change; tets, young and poisson are of the elements that are there
+    """
 
     object: str
     epoch: int
@@ -47,6 +50,7 @@ class Mesh:
     young: NDArray[np.float32]  # (m,) [Pa]; empty = not elastic
     poisson: NDArray[np.float32]  # (m,)
     skin: Skin | None = None
+    uncut: Mesh | None = None  # without any cut; None: this one
 
 
 @dataclass(frozen=True)
@@ -61,11 +65,43 @@ class Frame:
     v: NDArray[np.float64]  # (n, 3) [m/s]
 
 
-def mesh_of(message: pb.Topology) -> Mesh:
-    """Checks a topology and returns its arrays. Raises Refused."""
-    n, name = message.nodes, f"Topology of {message.header.object!r}"
-    if n == 0:
+def mesh_of(message: pb.Topology, before: Mesh | None = None) -> Mesh:
+    """Checks a topology and returns its arrays. Raises Refused.
+
+    before: any mesh of the object in this epoch, which has what a topology of a log leaves out after a cut
+    """
+    name = f"Topology of {message.header.object!r}"
+    if message.nodes == 0:
         raise Refused(f"{name}: nodes is 0; allowed: at least 1", "shape")
+    if not message.cut:
+        return _whole(message, name)
+    uncut = (before.uncut or before) if before is not None and not message.tets else _whole(message, name)
+    return _cut(uncut, message, name)
+
+
+def _cut(uncut: Mesh, message: pb.Topology, name: str) -> Mesh:
+    """Returns a mesh without the elements that were removed, and with the surface that is left."""
+    removed = array(message.removed, np.int32, (-1,), f"{name}: removed")
+    triangles = array(message.triangles, np.int32, (-1, 3), f"{name}: triangles")
+    check_range(removed, 0, len(uncut.tets), f"{name}: removed")
+    check_range(triangles, 0, len(uncut.rest), f"{name}: triangles")
+    there = np.ones(len(uncut.tets), bool)
+    there[removed] = False
+    skin = uncut.skin
+    if skin is not None:
+        corners = array(message.skin_triangles, np.int32, (-1, 3), f"{name}: skin_triangles")
+        check_range(corners, 0, len(skin.nodes), f"{name}: skin_triangles")
+        skin = replace(skin, triangles=corners)
+    moduli = {key: values[there] if len(values) else values for key, values in
+              (("young", uncut.young), ("poisson", uncut.poisson))}  # fmt: skip
+    return replace(
+        uncut, epoch=message.header.epoch + message.cut, tets=uncut.tets[there], triangles=triangles, skin=skin,
+        uncut=uncut, **moduli,
+    )  # fmt: skip
+
+
+def _whole(message: pb.Topology, name: str) -> Mesh:
+    n = message.nodes
     tets = array(message.tets, np.int32, (-1, 4), f"{name}: tets")
     triangles = array(message.triangles, np.int32, (-1, 3), f"{name}: triangles")
     fixed = array(message.fixed, np.int32, (-1,), f"{name}: fixed")
@@ -106,7 +142,7 @@ def frame_of(message: pb.State) -> Frame:
         raise Refused(f"{name}: nodes is 0; allowed: at least 1", "shape")
     x = array(message.x, np.float64, (n, 3), f"{name}: x")
     v = array(message.v, np.float64, (n, 3), f"{name}: v")
-    return Frame(message.header.object, message.header.epoch, message.step, message.time, x, v)
+    return Frame(message.header.object, message.header.epoch + message.cut, message.step, message.time, x, v)
 
 
 def _per_tet(data: bytes, tets: int, what: str) -> NDArray[np.float32]:

@@ -149,7 +149,8 @@ class Log:
             raise Refused("a message of an unknown channel")
         found = self.objects.setdefault(message.object, ObjectLog(message.object))
         if message.kind == "topology":
-            mesh = mesh_of(pb.Topology.FromString(message.data))
+            topology = pb.Topology.FromString(message.data)
+            mesh = mesh_of(topology, found.meshes.get(topology.header.epoch))
             found.meshes[mesh.epoch] = mesh
         elif message.kind == "state":
             frame = frame_of(pb.State.FromString(message.data))

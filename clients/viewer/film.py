@@ -51,9 +51,7 @@ class Stage:
         self._names = sorted(name for name, found in log.objects.items() if found.frames)
         if not self._names:
             raise BadInput(f"{log.path}: no frames were recorded")
-        self._surfaces = {
-            name: Surface(log.mesh(name, log.frame(name, 0).epoch), "displacement") for name in self._names
-        }
+        self._surfaces: dict[tuple[str, int], Surface] = {}
         self._times = {name: np.array([f.time for f in log.frames(name)]) for name in self._names}
         self._hands = _hands(log)
         low, high = self._box()
@@ -73,7 +71,7 @@ class Stage:
         pieces, frames = list(self._standing), {}
         for number, name in enumerate(self._names):
             frame = frames[name] = self._frame(name, time)
-            surface = self._surfaces[name]
+            surface = self._surface(frame)
             pieces.append(Piece(surface.points(frame.x), surface.triangles, BODIES[number % len(BODIES)]))
         for hand in self._hands.at(max(frame.step for frame in frames.values())):
             held = self._hands.held(hand, frames[hand.object].x)
@@ -82,6 +80,13 @@ class Stage:
             pieces.append(ball(target, 2.5 * self._rods, HAND))
         picture = paint(pieces, self._camera, self._size, self._floor)
         return self._captioned(picture, frames) if caption else picture
+
+    def _surface(self, frame: Frame) -> Surface:
+        """Returns the surface of the mesh that a frame has."""
+        key = frame.object, frame.epoch
+        if key not in self._surfaces:
+            self._surfaces[key] = Surface(self._log.mesh(*key), "displacement")
+        return self._surfaces[key]
 
     def _frame(self, name: str, time: float) -> Frame:
         times = self._times[name]
@@ -93,8 +98,9 @@ class Stage:
         for name in self._names:
             count = len(self._times[name])
             for index in np.unique(np.linspace(0, count - 1, min(count, SAMPLES)).astype(int)):
-                x = self._surfaces[name].points(self._log.frame(name, int(index)).x)
-                if np.isfinite(x).all():
+                frame = self._log.frame(name, int(index))
+                x = self._surface(frame).points(frame.x)
+                if len(x) and np.isfinite(x).all():
                     low, high = np.minimum(low, x.min(axis=0)), np.maximum(high, x.max(axis=0))
         return low, high
 

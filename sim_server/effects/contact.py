@@ -102,6 +102,7 @@ class Contact(Movable):
         super().__init__(world, "obstacle", self.obstacles, frames)
         surfaces = [_surface(world, body) for body in world.bodies]
         self.node = np.concatenate(surfaces)
+        self._free = world.free if world.touchable is None else world.touchable
         self.body = np.repeat(np.arange(len(surfaces), dtype=np.int32), [len(s) for s in surfaces])
         bounds = [_thickness(params, body) for body in world.bodies]
         self._shapes(max(bounds))
@@ -130,7 +131,7 @@ class Contact(Movable):
             self._table, start, corner, weight, np.full(rows, -1, np.int32), np.zeros((rows, 3)), np.zeros(rows),
             np.zeros((rows, 3)), np.full(rows, 2.0), np.zeros(rows), np.zeros(rows),
             thickness, np.ones(rows), np.zeros(rows), np.zeros((rows, 3)),
-            world.v, world.free, world.mass, world.dt, world.dt, params.passes, params.tolerance, self.dropped, faces,
+            world.v, self._free, world.mass, world.dt, world.dt, params.passes, params.tolerance, self.dropped, faces,
             surfaces_of, ties,
         )  # fmt: skip
         arrays = [*vars(self).values(), *vars(self._table).values(), *vars(self._input).values()]
@@ -178,7 +179,7 @@ class Contact(Movable):
         w.backend.keep(gravity, block_scale, exact=True)
         detect = w.backend.module(TEXT).bind(
             "detect", len(self.node), obstacles=len(self.obstacles), **vars(table), swept=self.swept,
-            pair_friction=self._pair_friction, node=self.node, body=self.body, x=w.x, predictor=w.v, free=w.free,
+            pair_friction=self._pair_friction, node=self.node, body=self.body, x=w.x, predictor=w.v, free=self._free,
             mass=w.mass, block=system.block, block_scale=block_scale, gravity=gravity, force_coefficient=w.dt,
             dx_dv=w.dt, kappa=self.params.stiffness, thickness=rows.thickness, obstacle=rows.obstacle,
             normal=rows.normal, gap=rows.gap, drift=rows.drift, entry=rows.entry, stiffness=rows.stiffness,
@@ -279,22 +280,26 @@ class Contact(Movable):
 
 
 def _surface(world: World, body: Body) -> Int32:
-    """Returns the free nodes of a body's surface, in numbers of the scene, ascending."""
-    nodes = np.unique(surface_triangles(body.mesh.tets)) + body.first
+    """Returns the free nodes of a body's surface, in numbers of the scene, ascending; all of one that may be cut."""
+    nodes = np.unique(body.mesh.tets if "cutting" in body.effects else surface_triangles(body.mesh.tets)) + body.first
     return nodes[world.free[nodes] > 0].astype(np.int32)
 
 
 def faces_of(world: World, friction: Float64, first: int) -> Faces | None:
     """Returns the triangles that need rows against obstacles, the first of which is `first`.
 
-    None where there are none: corners are enough against planes.
+    None where there are none: corners are enough against planes, and are all that touches of an object that may be cut.
     """
-    if all(o.shape == "plane" for o in world.obstacles):
+    if all(o.shape == "plane" for o in world.obstacles) or all("cutting" in b.effects for b in world.bodies):
         return None
-    triangles = [surface_triangles(b.mesh.tets) + np.int32(b.first) for b in world.bodies]
+    triangles = [_triangles_with_rows(b) + np.int32(b.first) for b in world.bodies]
     start = first + np.cumsum([0, *map(len, triangles)])
     triangle = np.concatenate(triangles).astype(np.int32)
     return Faces(start.astype(np.int32), triangle, edge_owners(triangle), friction, world.gravity())
+
+
+def _triangles_with_rows(body: Body) -> Int32:
+    return np.zeros((0, 3), np.int32) if "cutting" in body.effects else surface_triangles(body.mesh.tets)
 
 
 def _body_of_rows(start: Int32) -> Int32:

@@ -9,7 +9,9 @@ struct Settle {
     real* left_before;    // (n,) in, out: `left` in the last step
     double* changed_at;   // (n,) in, out: when the node last lost or got back an element [s]
     real* at_rest;        // (n,) in, out: 1 at nodes without elements
+    const real* surface;  // (n,) 1 at nodes of the surface
     real* free;           // (n,) in, out: 0 at these
+    real* touchable;      // (n,) out: 1 at nodes of the surface that move
     real* v;              // (n, 3) in, out [m/s]
     real* predictor;      // (n, 3) in, out [m/s]
 };
@@ -19,8 +21,10 @@ KERNEL(settle, Settle) {
     p.left_before[i] = p.left[i];
     const bool rests = p.left[i] == 0;
     if (rests && p.free[i] != 0) p.at_rest[i] = 1;
-    if (p.at_rest[i] == 0) return;
-    p.at_rest[i] = rests;
-    p.free[i] = rests ? 0 : 1;
-    for (int k = 0; k < 3; ++k) p.v[3 * i + k] = p.predictor[3 * i + k] = 0;
+    if (p.at_rest[i] != 0) {
+        p.at_rest[i] = rests;
+        p.free[i] = rests ? 0 : 1;
+        for (int k = 0; k < 3; ++k) p.v[3 * i + k] = p.predictor[3 * i + k] = 0;
+    }
+    p.touchable[i] = p.free[i] * p.surface[i];
 }

@@ -26,12 +26,15 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import AfterValidator, Field
 
+from sim_server.arrays import Float64
 from sim_server.backends.base import CutInput, Launch
 from sim_server.effects._base import Effect
 from sim_server.errors import InputError
-from sim_server.mechanics.removal import masses_left, numbers_of, present_nodes
+from sim_server.mechanics.removal import masses_left, numbers_of, present, present_nodes
 from sim_server.mechanics.system import Stencil, System
 from sim_server.mechanics.world import Body, World
+from sim_server.mesh.faces import Faces
+from sim_server.scene import Scene
 from sim_server.scene.live import Live
 from sim_server.scene.parameters import Parameters, complaint
 
@@ -55,6 +58,7 @@ class Params(Parameters):
 class Cutting(Effect):
     """Removed elements of all bodies that list the effect.
 
+    surface (n,): 1 at nodes of the surface; touchable (n,): 1 at those that move, which alone touch obstacles
     left (n,): part of each node's elements that is there; at_rest (n,): 1 at free nodes without any; changed_at (n,):
     time at which a node last lost or got back an element [s], -1: never
     """
@@ -69,9 +73,22 @@ class Cutting(Effect):
         n, masses = world.nodes, world.mass.copy()
         world.follow_into(world.mass, "cutting", compute=lambda scene: masses_left(scene, world, masses))
         self.left = world.follow("cutting", compute=lambda scene: present_nodes(scene, world))
+        self._faces = {body.index: Faces.of(body.mesh.tets) for body in self.bodies}
+        self.surface = world.follow("cutting", compute=self._on_surface)
+        self.touchable = world.touchable = np.zeros(n)
+        world.backend.keep(self.touchable)
         self._before, self.at_rest, self.changed_at = self.left.copy(), np.zeros(n), np.full(n, -1.0)
         world.backend.keep(self._before, self.at_rest)
         world.backend.keep(self.changed_at, exact=True)
+
+    def _on_surface(self, scene: Scene) -> Float64:
+        """Returns 1 for nodes of surfaces, and for those of objects that are not cut."""
+        out = np.ones(self.world.nodes)
+        for body in self.bodies:
+            triangles = self._faces[body.index].surface(present(scene, [body]))
+            out[body.nodes] = 0
+            out[triangles.ravel() + body.first] = 1
+        return out
 
     def check(self, effects: Mapping[str, Effect]) -> None:
         """Raises InputError where another effect would go on as if nothing had been removed."""
@@ -106,7 +123,7 @@ class Cutting(Effect):
         w = self.world
         settle: Launch = w.backend.module("effects/cutting.cu").bind(
             "settle", w.nodes, left=self.left, clock=system.clock, left_before=self._before,
-            changed_at=self.changed_at, at_rest=self.at_rest, free=w.free, v=w.v, predictor=w.predictor,
+            changed_at=self.changed_at, at_rest=self.at_rest, surface=self.surface, free=w.free, touchable=self.touchable, v=w.v, predictor=w.predictor,
         )  # fmt: skip
         return [settle]
 

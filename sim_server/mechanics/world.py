@@ -80,6 +80,7 @@ class World:
     rest (n, 3): before the pose [m]; x (n, 3): positions [m]; v (n, 3): velocities [m/s]; mass (n,): lumped [kg];
     free (n,): 1, or 0 at fixed nodes; held (n,): 1 at nodes of holders, which are fixed, too; held_nodes (held,): these
     nodes in the order of the launches over them; held_moves (bodies,): 1 where a holder moves in a step by stages;
+    touchable (n,): 1 at nodes that may touch obstacles, where that changes as objects are cut; None: as `free`
     rollers: nodes that may move along some directions only, None without any; alpha, beta (bodies,):
     Rayleigh damping of the mass [1/s] and of the stiffness [s] at the start; damping: both by the
     parameters of a scene; dt: time step [s];
@@ -137,6 +138,7 @@ class World:
         self.mass = np.concatenate([_lumped(o, mesh) for o, mesh in meshes])
         self.free, self.held = np.ones(first), np.zeros(first, np.int32)
         self.held_nodes, self.held_moves = np.zeros(0, np.int32), np.zeros(len(self.bodies), np.int32)
+        self.touchable: Float64 | None = None
         self.rollers: Rollers | None = None
         self.alpha, self.beta = np.zeros(len(self.bodies)), np.zeros(len(self.bodies))
         self.damping: Callable[[Scene], tuple[Float64, Float64]] = lambda _: (self.alpha, self.beta)

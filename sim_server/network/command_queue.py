@@ -18,6 +18,7 @@ LIMITED = (
     "grab",
     "move",
     "move_obstacle",
+    "cut",
     "set",
     "parameters",
     "reset",

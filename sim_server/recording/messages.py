@@ -86,7 +86,9 @@ def add_places(points: list[NamedPoints], status: pb.Status) -> None:
             vector.CopyFrom(pb.Vector(x=x, y=y, z=z))
 
 
-def state(body: Body, step: int, time: float, x: NDArray[np.float64], v: NDArray[np.float64]) -> pb.State:
+def state(
+    body: Body, step: int, time: float, x: NDArray[np.float64], v: NDArray[np.float64], cut: int = 0
+) -> pb.State:  # fmt: skip
     """Converts a frame of one object. x, v: positions [m] and velocities [m/s] of all nodes of the scene."""
     return pb.State(
         header=pb.Header(object=body.name, epoch=1),
@@ -95,6 +97,7 @@ def state(body: Body, step: int, time: float, x: NDArray[np.float64], v: NDArray
         nodes=body.last - body.first,
         x=_bytes(x[body.nodes], "<f8"),
         v=_bytes(v[body.nodes], "<f8"),
+        cut=cut,
     )
 
 

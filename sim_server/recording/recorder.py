@@ -86,8 +86,10 @@ class Recorder:
     def scene(self, message: pb.Scene, block: bool = False) -> None:
         self._append("/scene", message, 0, 0, block)
 
-    def topology(self, message: pb.Topology, block: bool = False) -> None:
-        self._append(f"/topology/{message.header.object}", message, self._time, message.header.epoch, block)
+    def topology(self, message: pb.Topology, block: bool = False, time: float | None = None) -> None:
+        """Appends a mesh, or what a cut changes of it. time: from which it holds [s of simulation]; None: now."""
+        stamp = self._time if time is None else self._stamp(time)
+        self._append(f"/topology/{message.header.object}", message, stamp, message.header.epoch + message.cut, block)
 
     def obstacle(self, message: pb.Obstacle, block: bool = False) -> None:
         self._append(f"/obstacle/{message.header.object}", message, self._time, 0, block)

@@ -153,7 +153,9 @@ class Recording:
             raise Refused("a message of an unknown channel")
         found = self.objects.setdefault(message.object, RecordedObject())
         if kind == "topology":
-            found.topology = pb.Topology.FromString(data)
+            topology = pb.Topology.FromString(data)
+            if not topology.cut:  # a cut follows from the parameters
+                found.topology = topology
         elif kind == "state":
             found.frames[pb.State.FromString(data).step] = message.offset, message.number
         elif kind == "interaction":

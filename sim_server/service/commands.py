@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 from protocol import messages_pb2 as pb
 from protocol.push_limits import LONGEST_PUSH
 from sim_server.recording import messages
+from sim_server.service import cuts
 from sim_server.simulation import Simulation
 
 if TYPE_CHECKING:
@@ -145,6 +146,9 @@ class Commands:
         done = self.simulation.parameters.set(values, command.client)
         return pb.Reply(parameters=map(messages.live_parameter, done))
 
+    def _cut(self, command: pb.Command) -> pb.Reply:
+        return cuts.carry_out(self.simulation, command.cut, command.client)
+
     def _parameters(self, command: pb.Command) -> pb.Reply:
         return pb.Reply(parameters=map(messages.live_parameter, islice(self.simulation.parameters, MOST_LISTED)))
 
@@ -262,7 +266,7 @@ def _finite(i: pb.Interaction, *names: str) -> None:
 
 VERBS: dict[str, Callable[[Commands, pb.Command], pb.Reply]] = {
     "push": Commands._push, "grab": Commands._grab, "move": Commands._move, "release": Commands._release,
-    "move_obstacle": Commands._move_obstacle, "set": Commands._set, "parameters": Commands._parameters,
+    "cut": Commands._cut, "move_obstacle": Commands._move_obstacle, "set": Commands._set, "parameters": Commands._parameters,
     "pause": Commands._pause, "resume": Commands._resume, "step": Commands._step, "reset": Commands._reset,
     "save": Commands._save, "stop": Commands._stop,
     "add_worker": Commands._add_worker, "kill_worker": Commands._kill_worker,

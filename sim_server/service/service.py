@@ -54,6 +54,7 @@ STATUS_INTERVAL = 0.02  # s between two statuses that clients request, at least
 MAX_SETS = 64  # commands that wait to set parameters
 LOOP_NICE = -5  # of the loop's thread in real time: before workers, clients and our own threads on a full machine
 ENDLESS = 1 << 62
+SETS = ("set", "cut")  # verbs that set parameters, which takes as long as many rounds
 AFTER_SETS = ("step", "resume", "reset", "save")  # verbs that wait for parameters that were to be set before
 
 Change = Callable[[Callable[[pb.Reply], None], pb.Reply], None]
@@ -184,7 +185,7 @@ class Service:
         done: list[pb.Command] = []
         with self.commands.together():
             for command, reply in waiting:
-                if command.verb == "set":
+                if command.verb in SETS:
                     self._defer(command, reply)
                     continue
                 if command.verb == "status":

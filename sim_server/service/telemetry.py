@@ -16,6 +16,7 @@ from sim_server.arrays import Float64
 from sim_server.backends.kinds import SLACK_OF_ENERGY
 from sim_server.checkpoint.file import Checkpoint
 from sim_server.mechanics.named_points import NamedPoints
+from sim_server.mechanics.world import Body
 from sim_server.network.link import ServerLink
 from sim_server.parameters import ParameterUpdate
 from sim_server.recording import messages
@@ -25,6 +26,7 @@ from sim_server.recording.recorder import Recorder
 from sim_server.recording.replay_recorder import ReplayRecorder
 from sim_server.service.commands import Commands
 from sim_server.service.contact_telemetry import ContactTelemetry
+from sim_server.service.cuts import CutTelemetry
 from sim_server.service.reaction_telemetry import ReactionTelemetry
 from sim_server.simulation import Simulation
 from sim_server.updates.driver import Driver
@@ -61,6 +63,7 @@ class Telemetry:
         self.commands = commands
         self.contact = ContactTelemetry(self.simulation, link, recorder)
         self.reactions = ReactionTelemetry(self.simulation, link)
+        self.cuts = CutTelemetry(self.simulation, link, recorder, patient)
         self.replay_recorder = ReplayRecorder(driver, link, recorder) if recorder and commands else None
         self.started = time.monotonic()
         self.record_every = self.simulation.scene.record.every if recorder else 0
@@ -101,6 +104,7 @@ class Telemetry:
             if self.recorder:
                 self.recorder.topology(topology)
         self.contact.open()
+        self.cuts.open()
         if self.recorder:
             if resumed is not None:
                 start = pb.Checkpoint(step=self.engine.step, data=resumed.to_bytes())
@@ -198,6 +202,7 @@ class Telemetry:
 
     def frames(self) -> None:
         """Sends states and poses of obstacles, to the log at the scene's rate, the newest ones to viewers."""
+        self.cuts.take()
         frames = self.engine.frames()
         for step, x, v in frames:
             if self.record_every and step % self.record_every == 0:
@@ -210,7 +215,11 @@ class Telemetry:
     def _publish_frame(self, step: int, x: Float64, v: Float64) -> None:
         for body in self.simulation.world.bodies:
             if self.link.wants_state(body.name):
-                self.link.publish_state(messages.state(body, step, step * self.simulation.world.dt, x, v))
+                self.link.publish_state(self._state(body, step, x, v))
+
+    def _state(self, body: Body, step: int, x: Float64, v: Float64) -> pb.State:
+        cut = self.cuts.number(body.name, step)
+        return messages.state(body, step, step * self.simulation.world.dt, x, v, cut)
 
     def on_reset(self, name: str, show: bool) -> None:
         """Takes note that an object, or all, were put back to the start. show: to viewers, as no step follows soon."""
@@ -250,8 +259,7 @@ class Telemetry:
     def _record_frame(self, step: int, x: Float64, v: Float64, poses: Float64 | None = None) -> None:
         assert self.recorder is not None
         for body in self.simulation.world.bodies:
-            message = messages.state(body, step, step * self.simulation.world.dt, x, v)
-            self.recorder.state(message, block=self.patient)
+            self.recorder.state(self._state(body, step, x, v), block=self.patient)
         self.contact.record_poses(step, poses, block=self.patient)
 
     def _on_set(self, update: ParameterUpdate) -> None:
@@ -291,7 +299,7 @@ class Telemetry:
                 pb.ObjectStatus(
                     object=body.name,
                     nodes=body.last - body.first,
-                    tets=len(body.mesh.tets),
+                    tets=len(body.mesh.tets) - self.cuts.removed.get(body.name, 0),
                     last=self._latest(body.index, bound),
                     mean_iterations=float(np.mean(window)) if window else 0.0,
                     excess=updates.solves.excess,

@@ -32,11 +32,12 @@ class Start:
     def reset(self, name: str = "") -> None:
         """Puts an object with its holders, or the whole scene (no name), back. Raises KeyError for an unknown one.
 
-        Of all that touches the object, or is tied to it, the forces, friction and breaks are forgotten. Parameters that
-        were set stay, and the loop has those that wait before.
+        Of all that touches the object, or is tied to it, the forces, friction and breaks are forgotten. What was cut is
+        whole again. Parameters that were set stay, and the loop has those that wait before.
         """
         s = self._simulation
         bodies = [s.world.body(name).index] if name else [b.index for b in s.world.bodies]
+        s.parameters.take_back(".cutting.removed", [s.world.bodies[index].name for index in bodies])
         s.engine.take_changes()
         back = self._arrays if not name else [(a, _with_rows(a, v, bodies[0])) for a, v in self._arrays if a.rows]
         for array, value in back:

@@ -1,0 +1,63 @@
+# SPDX-License-Identifier: MIT
+"""Which elements a cut takes: those that a swept blade meets, those in a sphere, those of a region."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sim_server.arrays import Float64, Int32, Int64
+from sim_server.mesh.surface import EDGES, FACES
+
+Bools = NDArray[np.bool_]
+
+
+def met_by_blade(x: Float64, tets: Int32, corners: Float64) -> Int64:
+    """Returns the numbers of the elements that a surface meets or touches.
+
+    x (n, 3), tets (m, 4): nodes [m] and elements. corners (3, 3) or (4, 3): of a triangle, or of a quadrangle as two
+    """
+    points = x[tets]
+    low, high = corners.min(axis=0), corners.max(axis=0)
+    near = np.flatnonzero(((points.max(axis=1) >= low) & (points.min(axis=1) <= high)).all(axis=1))
+    triangles = [corners[[0, 1, 2]], *([corners[[0, 2, 3]]] if len(corners) == 4 else [])]
+    met = np.zeros(len(near), bool)
+    for triangle in triangles:
+        met |= _meet(points[near], triangle)
+    return near[met]
+
+
+def in_sphere(x: Float64, tets: Int32, center: Float64, radius: float) -> Int64:
+    """Returns the numbers of the elements whose centroids are within `radius` of `center` [m]."""
+    away = x[tets].mean(axis=1) - center
+    return np.flatnonzero((away**2).sum(axis=1) <= radius**2)
+
+
+def _meet(points: Float64, triangle: Float64) -> Bools:
+    """Returns whether tetrahedra (m, 4, 3) meet a triangle (3, 3): an edge of one passes the other, or one holds it."""
+    begin, end = points[:, EDGES[:, 0]], points[:, EDGES[:, 1]]
+    met = _passes(begin, end, *(np.broadcast_to(corner, begin.shape) for corner in triangle)).any(axis=1)
+    faces = points[:, FACES]  # (m, 4, 3, 3)
+    for k in range(3):
+        a, b = (np.broadcast_to(triangle[j], faces.shape[:2] + (3,)) for j in (k, (k + 1) % 3))
+        met |= _passes(a, b, faces[:, :, 0], faces[:, :, 1], faces[:, :, 2]).any(axis=1)
+    return met | _inside(points, triangle[0])
+
+
+def _passes(a: Float64, b: Float64, p: Float64, q: Float64, r: Float64) -> Bools:
+    """Returns whether segments a b pass triangles p q r, all (..., 3); one that lies in the plane does not."""
+    normal = np.cross(q - p, r - p)
+    da, db = ((a - p) * normal).sum(-1), ((b - p) * normal).sum(-1)
+    way = np.where(da != db, da - db, 1)
+    at = a + (da / way)[..., None] * (b - a)
+    inside = np.ones(da.shape, bool)
+    for u, v in ((p, q), (q, r), (r, p)):
+        inside &= (np.cross(v - u, at - u) * normal).sum(-1) >= 0
+    return inside & (da != db) & (da * db <= 0)
+
+
+def _inside(points: Float64, point: Float64) -> Bools:
+    """Returns whether a point (3,) is in tetrahedra (m, 4, 3)."""
+    outward = np.ones(len(points), bool)
+    for face in FACES:
+        a, b, c = points[:, face[0]], points[:, face[1]], points[:, face[2]]
+        outward &= (np.cross(b - a, c - a) * (point - a)).sum(-1) <= 0
+    return outward
