@@ -66,7 +66,7 @@ from sim_server.scene.parameters import complaint
 from sim_server.scene.regions import Poisson, Regional, Young, region_values
 
 SCOPE = "object"
-REMOVED = 1e-20  # of its stiffness, which a removed element keeps, since kernels divide by mu
+REMOVED = 1e-24  # of its stiffness, which a removed element keeps, since kernels divide by mu
 
 
 class Params(Regional):

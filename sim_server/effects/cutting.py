@@ -7,7 +7,8 @@ move on their own, and stay one object. A node that has no element left rests wh
 
 The pattern of A stays, with zeros in it, so that nothing of a step depends on how much was cut, and factors of matrices
 from before a cut stay in use: their rows of nodes without elements are set apart, and on the nodes that lost elements
-since the factor's matrix, T, they get a direct solve before and after (a symmetric multiplicative Schwarz method) ::
+since the factor's matrix and their neighbours, T, they get a direct solve before and after (a symmetric multiplicative
+Schwarz method; on a CPU, as long as that is cheap) ::
 
     z1 = S r,   z2 = z1 + P (r - A z1),   z = z2 + S (r - A z2),   S = A_TT^-1 on T, 0 elsewhere
 

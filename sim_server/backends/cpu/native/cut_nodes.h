@@ -1,10 +1,10 @@
 // SPDX-License-Identifier: MIT
 // Keeps a factor useful after elements were removed (effects/cutting.py). With T the nodes that lost or got back elements since the
-// factor's matrix, and S the inverse of A on T, the symmetric multiplicative Schwarz method
+// factor's matrix and their neighbours, and S the inverse of A on T, the symmetric multiplicative Schwarz method
 //     z = S r + (I - S A) P^-1 (I - A S) r
 // is exact on T and positive definite if P is. Nodes without elements, whose rows of A are the identity, are set apart: z = 0 there.
 // S is a Cholesky factor with an envelope, in the order of Cuthill and McKee, made in each solve, since A changes. Where that costs
-// too much (ENOUGH_FOR_CUTS), T is left out and only the nodes without elements are set apart.
+// too much (ENOUGH_FOR_CUTS), the neighbours are left out, then all of T and only the nodes without elements are set apart.
 // (Smith, Bjorstad and Gropp, Domain Decomposition, 1996, section 1.3; George and Liu, Computer Solution of Large Sparse Positive
 // Definite Systems, 1981, chapter 4.)
 #pragma once
@@ -40,16 +40,15 @@ struct CutSolve {
 
     // Finds T and factorizes A on it. step: of the factor's matrix
     void prepare(int64_t step) {
-        const double since = c.start_time + (step + 0.5) * c.dt;
-        c.count = c.wanted = c.gone = 0;
-        for (int i = 0; i < c.nodes; ++i) {
-            c.place[i] = -1;
-            if (c.at_rest[i] != 0) ++c.gone;
-            else if (c.changed_at[i] > since && c.free[i] != 0) c.place[i] = -2, ++c.wanted;
+        for (int rings = 1; rings >= 0; --rings) {  // with the neighbours, unless that is too much
+            mark(c.start_time + (step + 0.5) * c.dt);
+            if (!c.wanted) return;
+            if (rings) widen();
+            sort();
+            if (!assemble()) continue;
+            if (factorize()) c.count = c.wanted;
+            return;
         }
-        if (!c.wanted) return;
-        sort();
-        if (assemble() && factorize()) c.count = c.wanted;
     }
 
     bool works() const { return c.count > 0 || c.gone > 0; }
@@ -98,6 +97,25 @@ private:
     void gather(const double* from, double* t) const {
         for (int k = 0; k < c.count; ++k)
             for (int m = 0; m < 3; ++m) t[3 * k + m] = from[3 * c.node[k] + m];
+    }
+
+    // Marks the nodes that lost or got back elements after a time.
+    void mark(double since) {
+        c.count = c.wanted = c.gone = 0;
+        for (int i = 0; i < c.nodes; ++i) {
+            c.place[i] = -1;
+            if (c.at_rest[i] != 0) ++c.gone;
+            else if (c.changed_at[i] > since && c.free[i] != 0) c.place[i] = -2, ++c.wanted;
+        }
+    }
+
+    // Adds the neighbours of the marked nodes.
+    void widen() {
+        for (int i = 0; i < c.nodes; ++i)
+            if (c.place[i] == -2)
+                each_block(i, [&](int j, const double*) { if (c.place[j] == -1 && c.at_rest[j] == 0 && c.free[j] != 0) c.place[j] = -3; });
+        for (int i = 0; i < c.nodes; ++i)
+            if (c.place[i] == -3) c.place[i] = -2, ++c.wanted;
     }
 
     // Numbers T part by part, neighbours after neighbours, and turns the order round.
