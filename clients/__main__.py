@@ -283,9 +283,8 @@ def move_obstacle(
 def cut(
     object: Object,
     blade: Annotated[
-        list[Triple] | None,
-        typer.Option(metavar="X Y Z", help="Corner of the surface that a blade sweeps, m; 3 or 4 times."),
-    ] = None,
+        str, typer.Option(metavar="CORNERS", help='3 or 4 of the surface that a blade sweeps, "X Y Z, X Y Z, ...", m.')
+    ] = "",
     sphere: Annotated[
         tuple[float, float, float, float] | None,
         typer.Option(metavar="X Y Z R", help="Takes the elements with centroids in it, m."),
@@ -302,7 +301,7 @@ def cut(
 
     \b
     Examples:
-      sim-client cut --object liver --blade 0 0 0 --blade 0.1 0 0 --blade 0.1 0.1 0 --blade 0 0.1 0
+      sim-client cut --object liver --blade "0 0 0, 0.1 0 0, 0.1 0.1 0, 0 0.1 0"
       sim-client cut --object beam --sphere 0.5 0.5 4 0.3
       sim-client cut --object beam --where "abs(Z - 2) < 0.1 and Y > 0.5"
     """
@@ -310,11 +309,20 @@ def cut(
 
     center, radius = (sphere[:3], sphere[3]) if sphere else (None, 0.0)
     with Client(server, connect) as client:
-        reply = client.cut(object, blade=blade, center=center, radius=radius, where=where, elements=elements)
+        reply = client.cut(object, blade=_corners(blade), center=center, radius=radius, where=where, elements=elements)
     if as_json:
         print(json.dumps({"removed": reply.removed, "left": reply.left}))
     else:
         print(f"{reply.removed} elements removed, {reply.left} left")
+
+
+def _corners(text: str) -> list[Triple]:
+    """Returns the points of a text such as "0 0 0, 1 0 0, 1 1 0"."""
+    corners = [corner.split() for corner in text.split(",")] if text else []
+    try:
+        return [(float(x), float(y), float(z)) for x, y, z in corners]
+    except ValueError:
+        raise BadInput(f"--blade {text!r}: must be 3 or 4 points, as \"0 0 0, 1 0 0, 1 1 0\"") from None
 
 
 @app.command()

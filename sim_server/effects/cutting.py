@@ -72,6 +72,7 @@ class Cutting(Effect):
                 "quasi_static leaves out"
             )
         n, masses = world.nodes, world.mass.copy()
+        world.uncut_mass = masses
         world.follow_into(world.mass, "cutting", compute=lambda scene: masses_left(scene, world, masses))
         self.left = world.follow("cutting", compute=lambda scene: present_nodes(scene, world))
         self._faces = {body.index: Faces.of(body.mesh.tets) for body in self.bodies}

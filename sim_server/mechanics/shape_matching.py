@@ -31,7 +31,7 @@ class ShapeMatching:
         self.world = world
         tets = np.concatenate([body.tets for body in bodies])
         self.start, self.neighbour = neighbours(tets, world.nodes, level)
-        self.arm = _arms(world.rest, world.mass, self.start, self.neighbour)
+        self.arm = _arms(world.rest, world.uncut_mass, self.start, self.neighbour)
 
     def launch(self, mean: Float64) -> Launch:
         """Launch that writes A_i in place of the sum of rotations `mean` (n, 10) at the bodies' nodes."""

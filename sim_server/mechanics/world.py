@@ -78,6 +78,7 @@ class World:
     """State and node data of a scene.
 
     rest (n, 3): before the pose [m]; x (n, 3): positions [m]; v (n, 3): velocities [m/s]; mass (n,): lumped [kg];
+    uncut_mass (n,): with all elements, where some may be removed [kg];
     free (n,): 1, or 0 at fixed nodes; held (n,): 1 at nodes of holders, which are fixed, too; held_nodes (held,): these
     nodes in the order of the launches over them; held_moves (bodies,): 1 where a holder moves in a step by stages;
     touchable (n,): 1 at nodes that may touch obstacles, where that changes as objects are cut; None: as `free`
@@ -136,6 +137,7 @@ class World:
         self.x = np.concatenate([posed(mesh.rest, o.pose.rotate, o.pose.translate) for o, mesh in meshes])
         self.v = np.zeros_like(self.x)
         self.mass = np.concatenate([_lumped(o, mesh) for o, mesh in meshes])
+        self.uncut_mass = self.mass
         self.free, self.held = np.ones(first), np.zeros(first, np.int32)
         self.held_nodes, self.held_moves = np.zeros(0, np.int32), np.zeros(len(self.bodies), np.int32)
         self.touchable: Float64 | None = None

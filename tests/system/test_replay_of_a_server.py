@@ -58,15 +58,15 @@ def grab_often(client: Client) -> None:
 
 def recorded(
     folder: Path, solver: str = "", preconditioner: str = "cholesky", *options: str,
-    touch: Callable[[Client], None] = push_and_grab,
+    touch: Callable[[Client], None] = push_and_grab, effects: str = "",
 ) -> Path:  # fmt: skip
     """A log of a beam that is touched while a worker makes its factors, which is there from one of the first steps on.
 
-    options: of the server [default: on the CPU].
+    options: of the server [default: on the CPU]. effects: more lines of its table of effects
     """
     stage, log = Stage(folder), folder / "run.mcap"
     scene = beam(folder, solver=solver)
-    scene.write_text(scene.read_text().replace('"cholesky"', f'"{preconditioner}"'))
+    scene.write_text(scene.read_text().replace('"cholesky"', f'"{preconditioner}"') + effects)
     try:
         server = stage.server(scene, "--steps", str(STEPS), "--record", str(log), "--workers", "1", *(options or CPU))
         with stage.client() as client:

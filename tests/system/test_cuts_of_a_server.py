@@ -1,0 +1,89 @@
+# SPDX-License-Identifier: MIT
+"""A beam cut by clients while it moves and a worker makes its factors: log, viewers, replay, reset."""
+
+import json
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from clients.client import Client
+from clients.errors import BadInput
+from clients.log.export import export
+from clients.log.reader import Log
+from clients.viewer.surface import Surface
+from tests.system.server_process import fresh, run, until
+from tests.system.test_replay_of_a_server import messages, recorded, replayed
+
+pytestmark = pytest.mark.system
+TETS = 3 * 3 * 10 * 6
+
+
+def cut_about(client: Client) -> None:
+    """A blade, a sphere, a region and numbers; what is refused; a cut under a grab."""
+    tip = client.meshes()["beam"]
+    assert len(tip.tets) == TETS and tip.uncut is None
+    with client.grab("beam", "tip", radius=0.5, stiffness=1e4) as held:
+        reply = client.cut("beam", where="Z > 3.8 and X > 0.6")
+        assert reply.removed > 0 and reply.left == TETS - reply.removed
+        held.move((1, 2, 4))
+        again = client.cut("beam", where="Z > 3.8 and X > 0.6")
+        assert (again.removed, again.left) == (0, reply.left)
+    where = ("--connect", client._where)
+    said = run("clients", "cut", "--object", "beam", "--sphere", "0.5", "0.5", "0.7", "0.4", "--json", *where)
+    assert said.returncode == 0 and json.loads(said.stdout)["left"] < reply.left, said.stderr
+    client.pause()
+    blade = "-5 -20 1.45, 5 -20 1.45, 5 20 1.45, -5 20 1.45"
+    said = run("clients", "cut", "--object", "beam", "--blade", blade, *where)
+    assert said.returncode == 0 and "elements removed" in said.stdout, said.stderr
+    left = client.cut("beam", elements="0-2").left
+    for bad, why in (
+        ({}, "one of blade, radius, where and elements"), ({"elements": "540"}, "elements 0 to 539"),
+        ({"where": "Q > 1"}, "Q"), ({"blade": [(0, 0, 0)]}, "1 corners"), ({"elements": "a"}, "element numbers"),
+    ):  # fmt: skip
+        with pytest.raises(BadInput, match=why):
+            client.cut("beam", **bad)
+    with pytest.raises(BadInput, match="no object 'liver'"):
+        client.cut("liver", where="true")
+    assert not any("removed" in p.now.key for p in client.parameters()), "changed by a command of its own"
+    client.resume()
+    until(lambda: len(client.meshes()["beam"].tets) == left, "who asks is told what is left")
+    assert fresh(client).objects[0].tets == left
+    time.sleep(0.1)
+
+
+def test_cuts_are_in_the_log_and_repeated_bit_for_bit(tmp_path: Path) -> None:
+    log = recorded(tmp_path, touch=cut_about, effects="cutting = true\n")
+    found = messages(log, "parameters")
+    assert len(found) >= 3 and all(p.key.endswith("cutting.removed") for m in found for p in m.parameters)
+    with Log(log) as opened:
+        assert opened.complete
+        meshes = opened.object_log("beam").meshes
+        epochs = opened.object_log("beam").epochs
+        assert epochs == sorted(epochs) and epochs[0] == 1 and len(set(epochs)) >= 3
+        left = [len(meshes[e].tets) for e in sorted(set(epochs))]
+        assert left == sorted(left, reverse=True) and left[0] == TETS > left[-1]
+        last = meshes[epochs[-1]]
+        assert last.uncut is meshes[1] and len(last.young) == left[-1]
+        assert set(np.unique(Surface(last, "displacement").nodes)) <= set(np.unique(last.tets))
+        to = tmp_path / "beam.npz"
+        export(opened, "beam", to)
+    with np.load(to) as arrays:
+        assert arrays["tets"].shape == (TETS, 4) and len(arrays["x"]) == len(epochs)
+        assert (arrays["removed_step"] > 0).sum() == TETS - left[-1]
+    assert replayed(log, 0)["same"]
+
+
+def reset_after_a_cut(client: Client) -> None:
+    client.cut("beam", where="abs(Z - 2) < 0.3")
+    until(lambda: len(client.meshes()["beam"].tets) < TETS, "it is cut")
+    time.sleep(0.05)
+    client.reset("beam")
+    until(lambda: len(client.meshes()["beam"].tets) == TETS, "it is whole again")
+    client.cut("beam", where="Z > 3.5")
+
+
+def test_a_reset_makes_whole_and_is_repeated(tmp_path: Path) -> None:
+    log = recorded(tmp_path, touch=reset_after_a_cut, effects="cutting = true\n")
+    assert replayed(log, 0)["same"]
