@@ -322,7 +322,7 @@ def _corners(text: str) -> list[Triple]:
     try:
         return [(float(x), float(y), float(z)) for x, y, z in corners]
     except ValueError:
-        raise BadInput(f"--blade {text!r}: must be 3 or 4 points, as \"0 0 0, 1 0 0, 1 1 0\"") from None
+        raise BadInput(f'--blade {text!r}: must be 3 or 4 points, as "0 0 0, 1 0 0, 1 1 0"') from None
 
 
 @app.command()

@@ -92,11 +92,10 @@ def _cut(uncut: Mesh, message: pb.Topology, name: str) -> Mesh:
         corners = array(message.skin_triangles, np.int32, (-1, 3), f"{name}: skin_triangles")
         check_range(corners, 0, len(skin.nodes), f"{name}: skin_triangles")
         skin = replace(skin, triangles=corners)
-    moduli = {key: values[there] if len(values) else values for key, values in
-              (("young", uncut.young), ("poisson", uncut.poisson))}  # fmt: skip
+    elastic = there if len(uncut.young) else slice(0)
     return replace(
         uncut, epoch=message.header.epoch + message.cut, tets=uncut.tets[there], triangles=triangles, skin=skin,
-        uncut=uncut, **moduli,
+        uncut=uncut, young=uncut.young[elastic], poisson=uncut.poisson[elastic],
     )  # fmt: skip
 
 

@@ -12,6 +12,7 @@ import logging
 import threading
 import time
 from collections.abc import Mapping, Sequence
+from typing import Literal
 
 from clients.client import Client
 from clients.errors import BadInput, ClientError
@@ -51,6 +52,7 @@ class Link:
         self.parameters: list[pb.LiveParameter] = []
         self._new_meshes: dict[str, Mesh] | None = None  # with moduli that were set
         self._elastic: dict[str, str] | None = None  # values of the effects of objects
+        self._cut = False  # frames are of another mesh
         self._renew_at: float | None = None  # when the meshes are to be asked for again
         self.lost = ""  # why the connection is over; empty: it is not
         self._stop, self._asked = threading.Event(), threading.Event()
@@ -58,8 +60,12 @@ class Link:
         self._thread.start()
 
     def frames(self) -> list[Frame]:
-        """Returns new frames, of each object the newest."""
-        return self._states.newest()
+        """Returns new frames, of each object the newest. One of another mesh than ours has the meshes asked for."""
+        frames = self._states.newest()
+        if any(f.object in self.meshes and f.epoch != self.meshes[f.object].epoch for f in frames):
+            self._cut = True
+            self.ask_now()
+        return frames
 
     def steps(self) -> list[pb.ObjectStep]:
         """Returns new steps of all objects."""
@@ -69,13 +75,14 @@ class Link:
         """Returns new poses, of each obstacle the newest."""
         return self._poses.newest() if self._poses is not None else []
 
-    def take_moduli(self) -> bool:
-        """Returns True if moduli were set since the last call; `meshes` has them then."""
+    def take_meshes(self) -> Literal["", "moduli", "cut"]:
+        """Returns what is new of the meshes since the last call; `meshes` has it then."""
         new, self._new_meshes = self._new_meshes, None
         if new is None:
-            return False
+            return ""
+        cut = any(mesh.epoch != self.meshes[name].epoch for name, mesh in new.items())
         self.meshes = new
-        return True
+        return "cut" if cut else "moduli"
 
     def ask_now(self) -> None:
         """Has status and parameters asked for at once."""
@@ -95,6 +102,7 @@ class Link:
                 if self.status.header.incarnation != self.incarnation:
                     raise ClientError("the server was started again")
                 failures = 0
+                self._ask_meshes()
                 self._ask_parameters()
                 self._ask_moduli()
             except (ClientError, BadInput) as error:
@@ -109,6 +117,14 @@ class Link:
                 return
             self._asked.wait(STATUS_PERIOD)
             self._asked.clear()
+
+    def _ask_meshes(self) -> None:
+        """Gets the meshes again after a cut."""
+        if self._cut:
+            with contextlib.suppress(ClientError):  # a late answer: the next frame has it asked for again
+                found = self.client.meshes()
+                if found.keys() == self.meshes.keys():
+                    self._new_meshes, self._cut = found, False
 
     def _ask_parameters(self) -> None:
         """Gets the parameters; a replay of a log has none, and a late answer leaves those that are known."""

@@ -125,7 +125,7 @@ class Page:
         if self._obstacles is not None:
             self._obstacles.move(link.poses())
         assert self.surfaces is not None
-        self._take_moduli(link)
+        self._take_meshes(link)
         moved = [frame for frame in link.frames() if self.surfaces.move(frame.object, frame.x)]
         modes = {tab: tab.mode.value for tab in self._all()}  # a person may change them at any time: read once
         self._colour(bool(moved), set(modes.values()))
@@ -181,11 +181,18 @@ class Page:
         described = described_objects(link.scene.resolved)
         self.grips = {name: grip(mesh, described.get(name, {})) for name, mesh in link.meshes.items()}
 
-    def _take_moduli(self, link: Link) -> None:
-        """Takes up moduli that were set: colours and springs of the old ones are made anew."""
+    def _take_meshes(self, link: Link) -> None:
+        """Takes up moduli that were set, and surfaces that were cut: colours and springs are made anew."""
         assert self.surfaces is not None
-        if link.take_moduli():
+        new = link.take_meshes()
+        if new == "cut":
+            old, self.surfaces = self.surfaces, self.surfaces.cut(link.meshes)
+            for hand in self._hands():
+                if hand.vertex < len(old.points) and len(self.surfaces.points):
+                    hand.vertex = self.surfaces.nearest(old.points[hand.vertex])[1]
+        elif new:
             self.surfaces.take_moduli(link.meshes)
+        if new:
             self._paints.clear()
             self._grip(link)
 

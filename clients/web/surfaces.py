@@ -43,6 +43,7 @@ class Surfaces:
     def __init__(self, meshes: Mapping[str, Mesh], most: int = MOST_VERTICES) -> None:
         whole = {name: _surface(mesh) for name, mesh in meshes.items()}
         total = sum(len(nodes) for nodes, _, _ in whole.values())
+        self._most = most
         self.full = total  # vertices before they were made fewer
         self.parts: dict[str, Part] = {}
         triangles, first = [np.zeros((0, 3), np.int32)], 0
@@ -69,6 +70,13 @@ class Surfaces:
         self.nodes[name] = x
         self.points[part.vertices] = part.at(x)
         return True
+
+    def cut(self, meshes: Mapping[str, Mesh]) -> Surfaces:
+        """Returns the surfaces of these meshes, which have the same nodes, where the nodes are now."""
+        found = Surfaces(meshes, self._most)
+        for name, x in self.nodes.items():
+            found.move(name, x)
+        return found
 
     def take_moduli(self, meshes: Mapping[str, Mesh]) -> None:
         """Takes Young's moduli and Poisson's ratios of other meshes; all else stays."""

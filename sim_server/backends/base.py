@@ -354,7 +354,7 @@ class EngineInput:
     held: Float64 | None
     errors: bool
     arrays: Mapping[str, NDArray[Any]]
-    cut: "CutInput | None" = None
+    cut: CutInput | None = None
 
 
 @dataclass(frozen=True)

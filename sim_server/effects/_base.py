@@ -59,9 +59,8 @@ class Effect:
     rotated: tuple[Body, ...] = ()
     elastic: Mapping[int, tuple[Float64, Float64]] = MappingProxyType({})
 
-    @property
-    def cuttable(self) -> bool:
-        """True if it goes on rightly where elements of its bodies are removed (cutting.py)."""
+    def cuttable(self, body: Body) -> bool:
+        """Returns whether it goes on rightly where elements of a body are removed (cutting.py)."""
         return False
 
     @property

@@ -229,9 +229,8 @@ class Hyperelastic(Tetrahedra):
         self.floor = world.follow("cutting", compute=defined)
         self.refused = np.tile([-1.0, 0.0], (len(self.elements), 1))
 
-    @property
-    def cuttable(self) -> bool:
-        """True if the law is defined for elements that are inside out, as removed ones may be."""
+    def cuttable(self, body: Body) -> bool:
+        """Returns whether the law is defined for elements that are inside out, as removed ones may be."""
         return self.law.regularizes or not self.law.refuses
 
     def _gradients_along(self, axes_of: Callable[[Values], Float64], gradients: Float64, scene: Scene) -> Float64:

@@ -137,9 +137,8 @@ class Contact(Movable):
         arrays = [*vars(self).values(), *vars(self._table).values(), *vars(self._input).values()]
         world.backend.keep(*(a for a in arrays if isinstance(a, np.ndarray)), exact=True)
 
-    @property
-    def cuttable(self) -> bool:
-        """True if obstacles are all that there is to touch."""
+    def cuttable(self, body: Body) -> bool:
+        """Returns whether obstacles are all that there is to touch."""
         return self._input.surfaces is None
 
     def _shapes(self, thickness: float) -> None:

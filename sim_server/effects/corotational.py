@@ -148,8 +148,7 @@ class Corotational(Effect):
         self.twist = np.zeros((m if self.variant == "_exact" else 0, 6))
         self._energy = np.zeros(m)
 
-    @property
-    def cuttable(self) -> bool:
+    def cuttable(self, body: Body) -> bool:
         return True
 
     def elastic_in(self, scene: Scene) -> Mapping[int, tuple[Float64, Float64]]:

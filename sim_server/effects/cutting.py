@@ -12,7 +12,7 @@ Schwarz method; on a CPU, as long as that is cheap) ::
 
     z1 = S r,   z2 = z1 + P (r - A z1),   z = z2 + S (r - A z2),   S = A_TT^-1 on T, 0 elsewhere
 
-The momentum of what stays is that before the cut. Cuts follow the elements, so edges are as rough as the mesh is coarse.
+The momentum of what stays is that before the cut. Cuts follow the elements: edges are as rough as the mesh is coarse.
 
 `removed` is what the scene begins with, and a live parameter: clients cut by `sim-client cut`, which sets it; so cuts
 are logged, replayed, kept by checkpoints, and taken back by a reset.
@@ -68,8 +68,13 @@ class Cutting(Effect):
         self.world, self.bodies = world, [body for body, _ in listed]
         if not world.inertia:
             raise InputError(
-                f"object {self.bodies[0].name!r}, effect cutting: pieces that come apart need inertia, which the scheme "
-                "quasi_static leaves out"
+                f"object {self.bodies[0].name!r}, effect cutting: pieces that come apart need inertia, which the "
+                "scheme quasi_static leaves out"
+            )
+        if world.backend.name == "gpu" and world.forces_alone and not world.explicit:
+            raise InputError(
+                f"object {self.bodies[0].name!r}, effect cutting: the scheme ros2 cannot go on with it on a GPU; "
+                "allowed there: others, as backward_euler"
             )
         n, masses = world.nodes, world.mass.copy()
         world.uncut_mass = masses
@@ -96,21 +101,22 @@ class Cutting(Effect):
         """Raises InputError where another effect would go on as if nothing had been removed."""
         w = self.world
         for body in self.bodies:
-            if wrong := [n for n in body.effects if n in effects and n != "fixed" and not effects[n].cuttable]:
+            listed = [e for e in effects.values() if e.name in body.effects and e.name != "fixed"]
+            if wrong := [e.name for e in listed if not e.cuttable(body)]:
                 raise self._refusal(body, f"elements cannot be removed with the effect {wrong[0]}")
             tied = {a.object for a in w.attachments} | {a.to for a in w.attachments}
             if body.name in tied | {end.object for s in w.springs for end in s.between}:
                 raise self._refusal(body, "an object with attachments or springs cannot be cut")
-        if "contact" in effects and not effects["contact"].cuttable:
+        if "contact" in effects and not effects["contact"].cuttable(self.bodies[0]):
             raise self._refusal(
-                self.bodies[0], "objects that are cut touch obstacles alone: contact = { between = false }, self = false"
+                self.bodies[0],
+                "objects that are cut touch obstacles alone: contact = { between = false }, self = false",
             )
 
     def _refusal(self, body: Body, why: str) -> InputError:
         return InputError(f"object {body.name!r}, effect cutting: {why}")
 
-    @property
-    def cuttable(self) -> bool:
+    def cuttable(self, body: Body) -> bool:
         return True
 
     @property
@@ -125,7 +131,8 @@ class Cutting(Effect):
         w = self.world
         settle: Launch = w.backend.module("effects/cutting.cu").bind(
             "settle", w.nodes, left=self.left, clock=system.clock, left_before=self._before,
-            changed_at=self.changed_at, at_rest=self.at_rest, surface=self.surface, free=w.free, touchable=self.touchable, v=w.v, predictor=w.predictor,
+            changed_at=self.changed_at, at_rest=self.at_rest, surface=self.surface, free=w.free,
+            touchable=self.touchable, v=w.v, predictor=w.predictor,
         )  # fmt: skip
         return [settle]
 

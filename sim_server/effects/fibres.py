@@ -82,8 +82,7 @@ class Fibres(Tetrahedra):
         self.constants = self.packed(LAW)
         self.directions = world.follow(LAW.name, compute=self._directions)
 
-    @property
-    def cuttable(self) -> bool:
+    def cuttable(self, body: Body) -> bool:
         return True
 
     def _directions(self, scene: Scene) -> Float64:

@@ -41,8 +41,7 @@ class Gravity(Effect):
         world.gravity_of = _gravity_of
         self.g = world.gravity()
 
-    @property
-    def cuttable(self) -> bool:
+    def cuttable(self, body: Body) -> bool:
         return True
 
     def launches(self, system: System, stencil: Stencil | None, accumulate: bool) -> list[Launch]:

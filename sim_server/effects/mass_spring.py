@@ -142,10 +142,9 @@ class MassSpring(Effect):
         """False if springs come from files, which workers do not read."""
         return not self._from_files
 
-    @property
-    def cuttable(self) -> bool:
-        """True if all springs are those of edges, which elements have a part in."""
-        return all(body.effects["mass_spring"].springs is None for body in self.bodies)
+    def cuttable(self, body: Body) -> bool:
+        """Returns whether the springs of a body are those of edges, which elements have a part in."""
+        return body.effects["mass_spring"].springs is None
 
     def elastic_in(self, scene: Scene) -> Mapping[int, tuple[Float64, Float64]]:
         given = zip(self.bodies, params_in(scene, "mass_spring", self.bodies), strict=True)

@@ -67,8 +67,7 @@ class Drag(Effect):
             found |= {(b.index, "stiffness"): "the stable step of an explicit scheme knows it" for b in self.bodies}
         return found
 
-    @property
-    def cuttable(self) -> bool:
+    def cuttable(self, body: Body) -> bool:
         return True
 
     def launches(self, system: System, stencil: Stencil | None, accumulate: bool) -> list[Launch]:

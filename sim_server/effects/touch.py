@@ -114,8 +114,7 @@ class Touch(Effect):
         self.force, self.spring, self.anchor = np.zeros_like(world.x), np.zeros(world.nodes), np.zeros_like(world.x)
         world.backend.keep(self.force, self.spring, self.anchor)
 
-    @property
-    def cuttable(self) -> bool:
+    def cuttable(self, body: Body) -> bool:
         return True
 
     def launches(self, system: System, stencil: Stencil | None, accumulate: bool) -> list[Launch]:

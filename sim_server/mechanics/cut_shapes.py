@@ -37,7 +37,7 @@ def _meet(points: Float64, triangle: Float64) -> Bools:
     met = _passes(begin, end, *(np.broadcast_to(corner, begin.shape) for corner in triangle)).any(axis=1)
     faces = points[:, FACES]  # (m, 4, 3, 3)
     for k in range(3):
-        a, b = (np.broadcast_to(triangle[j], faces.shape[:2] + (3,)) for j in (k, (k + 1) % 3))
+        a, b = (np.broadcast_to(triangle[j], (*faces.shape[:2], 3)) for j in (k, (k + 1) % 3))
         met |= _passes(a, b, faces[:, :, 0], faces[:, :, 1], faces[:, :, 2]).any(axis=1)
     return met | _inside(points, triangle[0])
 
@@ -51,7 +51,7 @@ def _passes(a: Float64, b: Float64, p: Float64, q: Float64, r: Float64) -> Bools
     inside = np.ones(da.shape, bool)
     for u, v in ((p, q), (q, r), (r, p)):
         inside &= (np.cross(v - u, at - u) * normal).sum(-1) >= 0
-    return inside & (da != db) & (da * db <= 0)
+    return np.asarray(inside & (da != db) & (da * db <= 0))
 
 
 def _inside(points: Float64, point: Float64) -> Bools:

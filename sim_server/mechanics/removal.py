@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Elements that were removed from an object, as the scene and its parameters name them, and what is left without them."""
+"""Elements that a scene and its parameters have removed from an object, and what is left without them."""
 
 import re
 from collections.abc import Sequence

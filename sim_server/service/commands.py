@@ -266,7 +266,8 @@ def _finite(i: pb.Interaction, *names: str) -> None:
 
 VERBS: dict[str, Callable[[Commands, pb.Command], pb.Reply]] = {
     "push": Commands._push, "grab": Commands._grab, "move": Commands._move, "release": Commands._release,
-    "cut": Commands._cut, "move_obstacle": Commands._move_obstacle, "set": Commands._set, "parameters": Commands._parameters,
+    "cut": Commands._cut, "move_obstacle": Commands._move_obstacle, "set": Commands._set,
+    "parameters": Commands._parameters,
     "pause": Commands._pause, "resume": Commands._resume, "step": Commands._step, "reset": Commands._reset,
     "save": Commands._save, "stop": Commands._stop,
     "add_worker": Commands._add_worker, "kill_worker": Commands._kill_worker,

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Cuts of clients: finds the elements, removes them by the parameter of the effect, and tells viewers of new surfaces."""
+"""Cuts of clients: finds the elements, removes them by a parameter of the effect, tells viewers of new surfaces."""
 
 import json
 import math

@@ -80,7 +80,7 @@ def test_masses_and_momentum_are_those_of_what_is_left():
     """A bar that flies and spins is cut in two: the momentum of the rest is what it had, and stays."""
     sim = made(fixed=False)
     world = sim.world
-    world.v[:] = np.cross([0.0, 1.0, 3.0], world.x - world.x.mean(axis=0)) + [1.0, 2.0, 0.0]
+    world.v[:] = np.cross([0.0, 1.0, 3.0], world.x - world.x.mean(axis=0)) + np.array([1.0, 2.0, 0.0])
     sim.engine.run(3)
     removed = cut(sim, HALVED)
     v = sim.fetch().v.copy()

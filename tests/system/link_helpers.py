@@ -157,3 +157,8 @@ def process(*arguments: str, **options: Any) -> Iterator[subprocess.Popen[str]]:
 def light_worker(endpoint: str, name: str = "light", *options: str) -> contextlib.AbstractContextManager[Any]:
     """A worker process with dense factors: the real network side, started in a fraction of a second."""
     return process(str(Path(__file__).parent / "light_worker.py"), endpoint, name, *options)
+
+
+def endpoint_of(client: Any) -> str:
+    """Where the server of a Client listens."""
+    return str(client._where)

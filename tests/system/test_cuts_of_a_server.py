@@ -13,6 +13,9 @@ from clients.errors import BadInput
 from clients.log.export import export
 from clients.log.reader import Log
 from clients.viewer.surface import Surface
+from clients.web.feed import Link
+from clients.web.surfaces import Surfaces
+from tests.system.link_helpers import endpoint_of
 from tests.system.server_process import fresh, run, until
 from tests.system.test_replay_of_a_server import messages, recorded, replayed
 
@@ -30,7 +33,7 @@ def cut_about(client: Client) -> None:
         held.move((1, 2, 4))
         again = client.cut("beam", where="Z > 3.8 and X > 0.6")
         assert (again.removed, again.left) == (0, reply.left)
-    where = ("--connect", client._where)
+    where = ("--connect", endpoint_of(client))
     said = run("clients", "cut", "--object", "beam", "--sphere", "0.5", "0.5", "0.7", "0.4", "--json", *where)
     assert said.returncode == 0 and json.loads(said.stdout)["left"] < reply.left, said.stderr
     client.pause()
@@ -76,9 +79,17 @@ def test_cuts_are_in_the_log_and_repeated_bit_for_bit(tmp_path: Path) -> None:
 
 
 def reset_after_a_cut(client: Client) -> None:
-    client.cut("beam", where="abs(Z - 2) < 0.3")
-    until(lambda: len(client.meshes()["beam"].tets) < TETS, "it is cut")
-    time.sleep(0.05)
+    """With a page that watches."""
+    link = Link(client.name, [endpoint_of(client)])
+    try:
+        surfaces = Surfaces(link.meshes)
+        client.cut("beam", where="abs(Z - 2) < 0.3")
+        until(lambda: (link.frames() and False) or link.take_meshes() == "cut", "the page hears of it by the frames")
+        cut = surfaces.cut(link.meshes)
+        assert len(link.meshes["beam"].tets) < TETS and len(cut.points) > len(surfaces.points), "inside is seen"
+        assert np.array_equal(cut.nodes["beam"], surfaces.nodes["beam"])
+    finally:
+        link.close()
     client.reset("beam")
     until(lambda: len(client.meshes()["beam"].tets) == TETS, "it is whole again")
     client.cut("beam", where="Z > 3.5")

@@ -10,6 +10,7 @@ import pytest
 from clients.client import Client
 from clients.errors import BadInput
 from clients.log.reader import Log
+from tests.system.link_helpers import endpoint_of
 from tests.system.server_process import run, until
 from tests.system.test_replay_of_a_server import messages, recorded, replayed
 
@@ -44,7 +45,7 @@ def by_command_line(client: Client) -> None:
     """The same, and others with sim-client in a pause, in which steps wait for it."""
     parameters_set(client)
     client.pause()
-    where = ("--connect", client._where)
+    where = ("--connect", endpoint_of(client))
     said = run("clients", "set", f"{YOUNG}=5e5", "beam.corotational.poisson=0.25", *where)
     assert said.returncode == 0 and "500000.0" in said.stdout and "Pa" in said.stdout, said.stderr
     bad = run("clients", "set", f"{YOUNG}=-1", *where)

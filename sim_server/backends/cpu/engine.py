@@ -472,8 +472,9 @@ class CpuEngine(Reports):
             self._contact.native.predictor = given.euler.start_v.ctypes.data
         elif self._contact and self._newton:
             self._contact.native.predictor = self._newton.search_in_contact(bodies).ctypes.data
-        self._cut = [_NativeCut(given.cut, self._body[index], given.dt, arrays) for index in
-                     (given.cut.bodies if given.cut and given.solver.wants_factors else ())]  # fmt: skip
+        self._cut: dict[int, _NativeCut] = {}
+        if given.cut and given.solver.wants_factors:
+            self._cut = {i: _NativeCut(given.cut, self._body[i], given.dt, arrays) for i in given.cut.bodies}
         obstacles = len(given.contact.obstacles.kind) if given.contact else 0
         if given.held is not None:
             loop.holders, loop.held_reaction = given.held.shape[1], given.held.ctypes.data
@@ -566,7 +567,7 @@ class CpuEngine(Reports):
     def resume(self, step: int, start_time: float) -> None:
         """Goes on from a state that was written, after `step` steps."""
         self.loop.step, self.loop.start_time, self._begun = step, start_time, True
-        for cut in self._cut:
+        for cut in self._cut.values():
             cut.native.start_time = start_time
         for entry in self._body:
             entry.steps = step
@@ -632,6 +633,12 @@ class CpuEngine(Reports):
         """Number of nodes at which the last solve corrected the factor in use. A probe for tests; only while the loop
         stands still."""
         return int(self._body[body].correction.used)
+
+    def cut_nodes(self, body: int) -> tuple[int, int, int]:
+        """Nodes that lost elements since the matrix of the factor in use, with neighbours; those that the last solve
+        treated; nodes without elements. A probe for tests; only while the loop stands still."""
+        native = self._cut[body].native
+        return native.wanted, native.count, native.gone
 
     def precondition(self, body: int, r: Reals) -> Reals:
         """P^-1 r, (3 nodes of the body,), with its factor as the next solve has it. A probe for tests. Needs a factor

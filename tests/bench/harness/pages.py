@@ -17,6 +17,7 @@ PAGES = (
     "rosenbrock",
     "explicit",
     "contact",
+    "cutting",
     "verification",
     "accuracy",
     "hard_cases",
