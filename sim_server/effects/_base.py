@@ -188,7 +188,7 @@ class PerBody(Generic[T]):
     def __call__(self, scene: Scene) -> list[T]:
         """Returns the results by the parameters of a scene, in the order of the bodies."""
         for body, params in zip(self._bodies, params_in(scene, self._name, self._bodies), strict=True):
-            if body.index not in self._last or self._last[body.index][0] is not params:
+            if body.index not in self._last or self._last[body.index][0] != params:
                 self._last[body.index] = params, self._compute(body, params)
         return [self._last[body.index][1] for body in self._bodies]
 

@@ -17,6 +17,10 @@ The momentum of what stays is that before the cut. Cuts follow the elements: edg
 `removed` is what the scene begins with, and a live parameter: clients cut by `sim-client cut`, which sets it; so cuts
 are logged, replayed, kept by checkpoints, and taken back by a reset.
 
+With `tear` a server looks at the largest principal stretch of each element, beside the steps, some fifty times a
+second, and removes those above it, the most stretched one of neighbours first. Without a server call `torn`
+(mechanics/cut_shapes.py) and set `removed`.
+
 Source: Cotin, Delingette and Ayache, A hybrid elastic model for real-time cutting, deformations and force feedback,
 2000 (removal); Smith, Bjorstad and Gropp, Domain Decomposition, 1996, section 1.3 (Schwarz).
 """
@@ -53,6 +57,9 @@ def _numbers(text: str) -> str:
 class Params(Parameters):
     removed: Annotated[str, AfterValidator(_numbers), Live(listed=False)] = Field(
         default="", description='elements that are not there, by their numbers in the mesh from 0, such as "3 7-9 12"'
+    )
+    tear: Annotated[float | None, Live(1.05, 4)] = Field(
+        default=None, gt=1, description="largest stretch of an element, above which it is removed [-]; none if left out"
     )
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Which elements a cut takes: those that a swept blade meets, those in a sphere, those of a region."""
+"""Which elements a cut takes: those that a swept blade meets, those in a sphere, those that are torn."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,6 +29,25 @@ def in_sphere(x: Float64, tets: Int32, center: Float64, radius: float) -> Int64:
     """Returns the numbers of the elements whose centroids are within `radius` of `center` [m]."""
     away = x[tets].mean(axis=1) - center
     return np.flatnonzero((away**2).sum(axis=1) <= radius**2)
+
+
+def torn(x: Float64, tets: Int32, gradients: Float64, present: Bools, limit: float) -> Int64:
+    """Returns the numbers of the elements whose largest principal stretch is above `limit`, ascending.
+
+    Of those that share a node only the most stretched one: others may hold once it is gone. x (n, 3) [m]; gradients
+    (m, 3, 3) of the shape functions of corners 1, 2, 3 [1/m]; present (m,)
+    """
+    corners = x[tets]
+    F = np.einsum("eai,eaj->eij", corners[:, 1:] - corners[:, :1], gradients)
+    above = np.flatnonzero(present & ((F**2).sum(axis=(1, 2)) > limit**2))  # the sum is that of all three
+    stretch = np.linalg.eigvalsh(F[above].swapaxes(1, 2) @ F[above])[:, 2] ** 0.5
+    order = np.argsort(-stretch, kind="stable")
+    taken, found = np.zeros(len(x), bool), []
+    for element in above[order[stretch[order] > limit]].tolist():
+        if not taken[tets[element]].any():
+            taken[tets[element]] = True
+            found.append(element)
+    return np.array(sorted(found), np.int64)
 
 
 def _meet(points: Float64, triangle: Float64) -> Bools:

@@ -10,7 +10,6 @@ import numpy as np
 from sim_server.arrays import Float64, Int64
 from sim_server.errors import InputError
 from sim_server.mechanics.world import Body, World
-from sim_server.mesh.surface import volumes
 from sim_server.scene import Scene
 
 NUMBERS = re.compile(r"\s*(\d{1,9})(?:-(\d{1,9}))?(?:\s+|$)")
@@ -75,7 +74,7 @@ def present_nodes(scene: Scene, world: World) -> Float64:
     for body in world.bodies:
         removed = removed_from(scene, body)
         if len(removed):
-            size = volumes(body.mesh.rest, body.mesh.tets)
+            size = body.mesh.volumes
             gone = np.zeros(len(size))
             gone[removed] = size[removed]
             n, corners = body.last - body.first, body.mesh.tets.ravel()

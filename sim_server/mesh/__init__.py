@@ -8,6 +8,7 @@ import logging
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from os.path import isfile
 from pathlib import Path
 from typing import Any
@@ -51,6 +52,11 @@ class Mesh:
             linear: Float64 = self.rest[self.tets].mean(axis=1)
             return linear
         return np.repeat(self.rest[self.quadratic[:, :4]].mean(axis=1), 8, axis=0)
+
+    @cached_property
+    def volumes(self) -> Float64:
+        """Volume of each tet [m3], (m,); kept."""
+        return volumes(self.rest, self.tets)
 
     def with_mid_nodes(self) -> "Mesh":
         """Returns the mesh with quadratic elements: a linear one gets a node in the middle of each edge, behind its

@@ -35,6 +35,7 @@ from sim_server.service.between_steps import BetweenSteps
 from sim_server.service.commands import Commands
 from sim_server.service.halts import Halts
 from sim_server.service.pace import LOOK_PERIOD, PaceMonitor
+from sim_server.service.tearing import Tearing
 from sim_server.service.telemetry import Telemetry
 from sim_server.simulation import Simulation
 from sim_server.state.start import Start
@@ -84,6 +85,7 @@ class Service:
         self._halts = Halts(self.commands)
         self._between = BetweenSteps(self.engine.loop)
         self._start = Start(simulation)
+        self._tearing = Tearing(simulation)
         self._sets: deque[tuple[pb.Command, Callable[[pb.Reply], None]]] = deque()  # that set parameters
         self._status_due = self._workers_due = self._pace_due = self._set_due = 0.0
         self.check_workers: Callable[[], None] = lambda: None  # called every WORKERS_PERIOD
@@ -166,6 +168,7 @@ class Service:
             self.link.check_name()
         self._carry_out()
         self._set_parameters()
+        self._tearing.look()
         if self._between.may_run:
             self._drain()
             self._between.run()

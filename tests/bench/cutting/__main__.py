@@ -26,14 +26,14 @@ CUTS = {  # what is removed of the beam of 1 x 1 x 4 m
     "one element": "0", "surface, ten": "10", "slit": "abs(Z - 2) < 0.1 and Y > 0.5", "corner": "Z > 3.4 and Y > 0.5",
     "through": "abs(Z - 2) < 0.1", "a third, scattered": "1000",
 }  # fmt: skip
-METHODS = ("block Jacobi", "old factor as it is", "old factor, corrected", "new factor")
+METHODS = ("block Jacobi", "plain old factor", "corrected old factor", "new factor")
 BEFORE, AFTER, AGE = 14, 3, 6  # steps; the factor's age at the cut, at most
 EXPLAINED = (
     "The beam of the README (1 x 1 x 4 m, E = 1 MPa, nu = 0.45, linear elements, dt = 20 ms, backward Euler, tolerance "
     "1e-6) is let go; after some steps elements are removed. Corotational elements, lockstep, so that each run has the "
     "same factors: made at most six steps before the cut, and none that knows of it in the steps shown.",
     "*iterations* are those of the worst of the three steps after the cut. *block Jacobi*: what is left if factors are "
-    "not used until a new one comes. *as it is*: the factor from before the cut. *corrected*: as it is done "
+    "not used until a new one comes. *plain*: the factor from before the cut. *corrected*: as it is done here "
     "([how](../preconditioners.md#when-elements-are-removed)). *new factor*: of the very matrix, made in the step.",
 )
 LAG, SHARE = 10, 0.01  # steps; part of the elements a second
@@ -81,7 +81,7 @@ def after_a_cut(cells: list[int]) -> list[dict[str, Any]]:
         for method in METHODS:
             kept = Cutting.cut_input
             try:
-                if method == "old factor as it is":
+                if method == "plain old factor":
                     Cutting.cut_input = lambda self: None  # type: ignore[method-assign, assignment, return-value]
                 row[method], removed = iterations(cells, what, method)
             finally:

@@ -1,0 +1,48 @@
+# SPDX-License-Identifier: MIT
+"""Removes elements that are stretched too far, as a client would: beside the steps, by the parameter of the effect."""
+
+import json
+import time
+
+import numpy as np
+
+from sim_server.arrays import Float64
+from sim_server.mechanics.cut_shapes import torn
+from sim_server.mechanics.removal import present, removed_from, text_of
+from sim_server.mesh.shape_functions import shape_gradients
+from sim_server.simulation import Simulation
+
+PERIOD = 0.02  # s between two looks
+KEY = "object.{}.effects.cutting.removed"
+
+
+class Tearing:
+    """Looks at the objects whose scene gives a limit of stretch."""
+
+    def __init__(self, simulation: Simulation):
+        self._simulation = simulation
+        self._bodies = [
+            b for b in simulation.world.bodies if "cutting" in b.effects and b.effects["cutting"].tear is not None
+        ]
+        self._gradients: dict[int, Float64] = {}
+        self._due, self._step = 0.0, -1
+
+    def look(self) -> None:
+        """Removes what is torn, if there is something to look at since the last call and it is due."""
+        step = self._simulation.engine.step
+        if not self._bodies or step == self._step or time.monotonic() < self._due:
+            return
+        self._step = step
+        world, scene = self._simulation.world, self._simulation.parameters.scene
+        x, values = world.backend.fetch(world.x), {}
+        for body in self._bodies:
+            if body.index not in self._gradients:
+                self._gradients[body.index] = shape_gradients(body.mesh.rest, body.mesh.tets)[1]
+            limit = scene.objects[body.index].effects["cutting"].tear  # type: ignore[attr-defined]
+            there = present(scene, [body]) > 0
+            found = torn(x[body.nodes], body.mesh.tets, self._gradients[body.index], there, limit)
+            if len(found):
+                values[KEY.format(body.name)] = json.dumps(text_of(np.append(removed_from(scene, body), found)))
+        if values:
+            self._simulation.parameters.set(values)
+        self._due = time.monotonic() + PERIOD
