@@ -283,14 +283,15 @@ def move_obstacle(
 def cut(
     object: Object,
     blade: Annotated[
-        str, typer.Option(metavar="CORNERS", help='3 or 4 of the surface that a blade sweeps, "X Y Z, X Y Z, ...", m.')
-    ] = "",
+        str | None,
+        typer.Option(metavar="CORNERS", help='3 or 4 of the surface that a blade sweeps, "X Y Z, X Y Z, ...", m.'),
+    ] = None,
     sphere: Annotated[
         tuple[float, float, float, float] | None,
         typer.Option(metavar="X Y Z R", help="Takes the elements with centroids in it, m."),
     ] = None,
-    where: Annotated[str, typer.Option(metavar="EXPRESSION", help="In X, Y, Z of centroids at rest.")] = "",
-    elements: Annotated[str, typer.Option(metavar="NUMBERS", help='Of the mesh, from 0, as "3 7-9 12".')] = "",
+    where: Annotated[str | None, typer.Option(metavar="EXPRESSION", help="In X, Y, Z of centroids at rest.")] = None,
+    elements: Annotated[str | None, typer.Option(metavar="NUMBERS", help='Of the mesh, from 0, as "3 7-9 12".')] = None,
     as_json: Json = False,
     connect: Connect = None,
     server: Server = SERVER_NAME,
@@ -309,7 +310,14 @@ def cut(
 
     center, radius = (sphere[:3], sphere[3]) if sphere else (None, 0.0)
     with Client(server, connect) as client:
-        reply = client.cut(object, blade=_corners(blade), center=center, radius=radius, where=where, elements=elements)
+        reply = client.cut(
+            object,
+            blade=_corners(blade or ""),
+            center=center,
+            radius=radius,
+            where=where or "",
+            elements=elements or "",
+        )
     if as_json:
         print(json.dumps({"removed": reply.removed, "left": reply.left}))
     else:
