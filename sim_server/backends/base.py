@@ -335,6 +335,7 @@ class EngineInput:
     held: (bodies, k, 6) force [N] and torque [N m] on each holder, attachment and spring; None: there are none
     errors: whether the estimated errors of positions are wanted where they cost time
     arrays: of the system by name: row_start, columns, values, b, y, x, v, clock, moving, rotation
+    history: launches that begin every step, once, whatever attempts, trials or stages it takes
     """
 
     assemble: Sequence[Launch]
@@ -353,6 +354,7 @@ class EngineInput:
     held: Float64 | None
     errors: bool
     arrays: Mapping[str, NDArray[Any]]
+    history: Sequence[Launch] = ()
 
 
 class Backend(Protocol):

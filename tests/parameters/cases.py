@@ -63,6 +63,8 @@ CASES = {
                  **{key: 3.0 for key in COSTA}, a=3e4, bulk=2e5, fibre=[0, 1, 0.5], sheet=[0, 0, 1]),
     "fibres": Case({"corotational": YOUNG, "fibres": {"stiffness": 2e4} | STRETCHED},
                    {"bar.fibres.stiffness": 9e4, "bar.fibres.exponent": 2.0, "bar.fibres.direction": [0, 1, 1]}),
+    "prony": Case({"corotational": YOUNG, "prony": {"terms": [{"g": 1.5, "tau": 1e4}], "shear": 3e4}},
+                  {"bar.prony.shear": 2e5, "bar.corotational.young": 2e5}, MappingProxyType({}), True),
     "rayleigh": Case({"corotational": YOUNG, "rayleigh": {"mass": 0.1}},
                      {"bar.rayleigh.mass": 3.0, "bar.rayleigh.stiffness": 0.02}),
     "traction": Case({"corotational": YOUNG, "traction": LOADS},
