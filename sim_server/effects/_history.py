@@ -27,8 +27,10 @@ from numpy.typing import NDArray
 
 from sim_server.arrays import Float64, Int32
 from sim_server.backends.base import Launch
+from sim_server.backends.energies import ElementEnergies
 from sim_server.effects._base import Effect
 from sim_server.effects._hyperelastic import Tetrahedra
+from sim_server.errors import InputError
 from sim_server.mechanics.world import Body, World
 from sim_server.scene import Scene
 from sim_server.scene.integrator_options import IntegratorOptions
@@ -50,10 +52,27 @@ class ParamsWithHistory(Parameters):
         return self
 
 
+def beside_corotational(name: str, listed: list[tuple[Body, Any]]) -> None:
+    """Raises InputError for a body without corotational elements by polar decomposition beside the effect `name`."""
+    for body, _ in listed:
+        law = body.effects.get("corotational")
+        if law is None:
+            raise InputError(
+                f"object {body.name!r}, effect {name}: it takes from the forces of corotational elements: list "
+                "corotational beside it"
+            )
+        if law.rotation != "polar":
+            raise InputError(
+                f'object {body.name!r}, effect {name}: its strains are those by corotational.rotation = "polar"; given '
+                f"is {law.rotation!r}"
+            )
+
+
 class TetrahedraWithHistory(Tetrahedra):
     """Tetrahedra of all bodies that list an effect with a memory.
 
-    text: path of its kernel text. memory: arrays (k, m) that a step carries on. shear, lame: moduli of the laws beside.
+    text: path of its kernel text. memory: arrays (k, m) that a step carries on. laws: effects with moduli listed beside
+    it, by index of the body; shear (m,): shear moduli [Pa], once all effects are built.
     """
 
     text = ""
@@ -62,6 +81,7 @@ class TetrahedraWithHistory(Tetrahedra):
         super().__init__(world, listed)
         self.memory: dict[str, Float64] = {}
         self.laws: dict[int, list[Effect]] = {body.index: [] for body in self.bodies}
+        self.shear = np.zeros(0)
 
     def remember(self, **rows: int) -> None:
         """Makes the arrays of the memory, 0 at the start: (rows, m) by name."""
@@ -71,6 +91,12 @@ class TetrahedraWithHistory(Tetrahedra):
     def join(self, others: Sequence[Effect]) -> None:
         for body in self.bodies:
             self.laws[body.index] = [e for e in others if e is not self and body.index in e.elastic]
+        names = {law.name for laws in self.laws.values() for law in laws}
+        self.shear = self.world.follow(self.name, *sorted(names), compute=self.shear_in)
+
+    def shear_in(self, scene: Scene) -> Float64:
+        """Returns the shear modulus of each element, (m,) [Pa]."""
+        return self.elasticity(scene)[1]
 
     def elasticity(self, scene: Scene) -> tuple[Float64, Float64]:
         """Returns Lame's constants lambda and mu of the laws listed beside, summed, (m,) each [Pa]."""
@@ -84,11 +110,6 @@ class TetrahedraWithHistory(Tetrahedra):
             mu = young / (2 * (1 + poisson))
             total += [2 * mu * poisson / (1 - 2 * poisson), mu]
         return total
-
-    @property
-    def law_names(self) -> list[str]:
-        """Names of the laws listed beside, whose parameters `elasticity` follows."""
-        return sorted({law.name for laws in self.laws.values() for law in laws})
 
     def watched(self) -> Int32:
         """A node of each element's body that is free unless the body is frozen, (m,)."""
@@ -104,6 +125,24 @@ class TetrahedraWithHistory(Tetrahedra):
             watched=self.watched(), **self.memory, **arguments,
         )  # fmt: skip
         return [launch]
+
+    def bind_elements(self, **arguments: Any) -> Launch:
+        """Returns the launch that makes forces and tangent of the elements."""
+        w = self.world
+        launch: Launch = w.backend.module(self.text).bind(
+            "elements", len(self.elements), tets=self.elements, x=w.x, v=w.predictor, gradients=self.gradients,
+            volume=self.volume, shear=self.shear, h=w.force_coefficient, tangent=w.force_coefficient * w.dx_dv,
+            **self.memory, corners=self.corners, edges=self.edges, **arguments,
+        )  # fmt: skip
+        return launch
+
+    def bind_energy(self, **arguments: Any) -> ElementEnergies:
+        """Returns the energies of the elements."""
+        launch = self.world.backend.module(self.text).bind(
+            "energy", len(self.elements), tets=self.elements, x=self.world.x, gradients=self.gradients,
+            volume=self.volume, shear=self.shear, **self.memory, energy=self._energy, **arguments,
+        )  # fmt: skip
+        return ElementEnergies(launch, self._energy, self.owner)
 
     def rows_of_bodies(self, array: NDArray[Any]) -> Callable[[int], Any] | None:
         if all(array is not own for own in self.memory.values()):

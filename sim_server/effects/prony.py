@@ -33,6 +33,7 @@ Source: Taylor, Pister, Goudreau, Thermomechanical analysis of viscoelastic soli
 Inelasticity, 1998, section 10.3; Kaliske and Rothert 1997.
 """
 
+from collections.abc import Sequence
 from typing import Annotated, Any
 
 import numpy as np
@@ -87,9 +88,8 @@ class Prony(TetrahedraWithHistory):
             table[: len(params.terms), :, k] = [[term.g, term.tau] for term in params.terms]
         rows = np.repeat(table, counts, axis=2)[:, :, self.order]
         self.weight, self.tau = (np.ascontiguousarray(rows[:, k]) for k in (0, 1))
-        self.shear = np.zeros(0)
 
-    def join(self, others: Any) -> None:
+    def join(self, others: Sequence[Effect]) -> None:
         super().join(others)
         for body in self.bodies:
             if not self.laws[body.index] and body.effects["prony"].shear is None:
@@ -97,12 +97,13 @@ class Prony(TetrahedraWithHistory):
                     f"object {body.name!r}, effect prony: nothing beside it has a shear modulus that g is relative to; "
                     "list a law with moduli, as corotational or neo_hookean, or give shear [Pa]"
                 )
-        self.shear = self.world.follow("prony", *self.law_names, compute=self._shear)
 
-    def _shear(self, scene: Scene) -> Float64:
+    def shear_in(self, scene: Scene) -> Float64:
         given = [params.shear for params in params_in(scene, "prony", self.bodies)]
-        own = np.repeat([np.nan if g is None else g for g in given], [len(b.mesh.tets) for b in self.bodies])
-        return np.where(np.isnan(own[self.order]), self.elasticity(scene)[1], own[self.order])
+        own = np.repeat([np.nan if g is None else g for g in given], [len(b.mesh.tets) for b in self.bodies])[
+            self.order
+        ]
+        return np.where(np.isnan(own), super().shear_in(scene), own)
 
     def _factors(self, time: float) -> tuple[Float64, Float64]:
         """What is left of q after a time [s], and gamma of a strain that grows over it, (terms, m) each."""
@@ -114,25 +115,15 @@ class Prony(TetrahedraWithHistory):
 
     def launches(self, system: System, stencil: Stencil | None, accumulate: bool) -> list[Launch]:
         assert stencil is not None
-        w = self.world
-        decay, gain = self._factors(w.balance_point * w.dt)
-        elements = w.backend.module(self.text).bind(
-            "elements", len(self.elements), tets=self.elements, x=w.x, v=w.predictor, gradients=self.gradients,
-            volume=self.volume, shear=self.shear, h=w.force_coefficient, tangent=w.force_coefficient * w.dx_dv,
-            terms=self.terms, kept=self.weight * decay, share=(self.weight * gain).sum(axis=0), **self.memory,
-            corners=self.corners, edges=self.edges,
-        )  # fmt: skip
+        decay, gain = self._factors(self.world.balance_point * self.world.dt)
+        kept, share = self.weight * decay, (self.weight * gain).sum(axis=0)
+        elements = self.bind_elements(terms=self.terms, kept=kept, share=share)
         return [elements, *self.gathers(system, stencil, accumulate)]
 
     def energies(self) -> ElementEnergies:
         """V mu sum of g |q|^2 at the end of a step [J]."""
         decay, gain = self._factors(self.world.dt)
-        launch = self.world.backend.module(self.text).bind(
-            "energy", len(self.elements), tets=self.elements, x=self.world.x, gradients=self.gradients,
-            volume=self.volume, shear=self.shear, terms=self.terms, weight=self.weight, decay=decay, gain=gain,
-            **self.memory, energy=self._energy,
-        )  # fmt: skip
-        return ElementEnergies(launch, self._energy, self.owner)
+        return self.bind_energy(terms=self.terms, weight=self.weight, decay=decay, gain=gain)
 
 
 def build(world: World, listed: list[tuple[Body, Any]]) -> Effect:

@@ -335,6 +335,7 @@ LAW_ELEMENTS = [
     (f"{PATCH_FRAMES[0]}+effects/neo_hookean.cuh", "HyperelasticPatchElements", "neo_hookean.elements"),
     ("effects/fibres.cu", "FibresElements", "fibres.elements"),
     ("effects/prony.cu", "PronyElements", "prony.elements"),
+    ("effects/plasticity.cu", "PlasticElements", "plasticity.elements"),
 ]
 LAW_PATCHES = [
     (f"{PATCH_FRAMES[1]}+effects/neo_hookean.cuh", "PatchPressures", "neo_hookean.pressures"),

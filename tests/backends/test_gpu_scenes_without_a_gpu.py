@@ -75,6 +75,11 @@ SCENES = {
         "solver.precision=mixed",
         "integrator.linearizations=3",
     ),
+    "beam.toml, plasticity, mixed, Newton": (
+        "object.beam.effects.plasticity.yield_stress=1e3",
+        "solver.precision=mixed",
+        "integrator.linearizations=3",
+    ),
     "springs.toml": (),
     "fibres.toml": ("integrator.scheme=bdf2",),
     "equilibrium.toml": (),

@@ -16,7 +16,8 @@ from tests.reference import history as reference
 from tests.scenes import bar, rotation, simulation
 
 TERMS = [{"g": 0.8, "tau": 0.03}, {"g": 0.3, "tau": 0.5}]
-EFFECTS: dict[str, dict[str, Any]] = {"prony": {"terms": TERMS}}
+FLOW = {"yield_stress": 60.0, "hardening": 500.0, "kinematic": 300.0}
+EFFECTS: dict[str, dict[str, Any]] = {"prony": {"terms": TERMS}, "plasticity": FLOW}
 FLOOR: dict[str, Any] = {"name": "floor", "shape": "plane"}
 DT = 0.01
 
@@ -40,6 +41,10 @@ def memory_of(sim: Simulation) -> TetrahedraWithHistory:
 def remembered(effect: TetrahedraWithHistory, path: list[NDArray]) -> dict[str, NDArray]:
     """The memory after a path, by the plain reference."""
     rest, tets = effect.world.rest, effect.elements
+    if effect.name == "plasticity":
+        constants = FLOW["yield_stress"], FLOW["hardening"], FLOW["kinematic"]
+        plastic, hardened = reference.plasticity(path, rest, tets, effect.shear[0], constants)
+        return {"plastic": reference.rows(plastic), "hardened": hardened[None]}
     pairs = [(term["g"], term["tau"]) for term in TERMS]
     q = reference.prony(path, rest, tets, pairs, DT)
     last = reference.deviator(reference.turned(path[-1], rest, tets)[1] - np.eye(3))

@@ -64,3 +64,32 @@ def forces(x: Array, rest: Array, tets: Any, stress: Array) -> Array:
         A = np.tensordot(np.linalg.lstsq(system, lack.ravel(), rcond=None)[0], generators, 1)
         np.add.at(out, corners, -volume[e] * D[e] @ (R[e] @ (stress[e] + A)).T)
     return out
+
+
+def plastic_return(strain: Array, plastic: Array, hardened: Array, mu: float, constants: Any) -> tuple[Array, Array]:
+    """Plastic strain (m, 3, 3) and equivalent one (m,) at a strain, by bisection for the amount of flow."""
+    yield_stress, isotropic, kinematic = constants
+    e = deviator(strain)
+    found, grown = plastic.copy(), hardened.copy()
+    for k in range(len(e)):
+        xi = 2 * mu * (e[k] - plastic[k]) - 2 / 3 * kinematic * plastic[k]
+        size = np.linalg.norm(xi)
+        if size <= np.sqrt(2 / 3) * (yield_stress + isotropic * hardened[k]):
+            continue
+        low, high = 0.0, size / (2 * mu)
+        for _ in range(200):
+            amount = (low + high) / 2
+            over = size - (2 * mu + 2 / 3 * kinematic) * amount
+            over -= np.sqrt(2 / 3) * (yield_stress + isotropic * (hardened[k] + np.sqrt(2 / 3) * amount))
+            low, high = (amount, high) if over > 0 else (low, amount)
+        found[k] += amount * xi / size
+        grown[k] += np.sqrt(2 / 3) * amount
+    return found, grown
+
+
+def plasticity(path: Iterable[Array], rest: Array, tets: Any, mu: float, constants: Any) -> tuple[Array, Array]:
+    """Plastic strain (m, 3, 3) and equivalent one (m,) after steps that begin at the positions of the path."""
+    plastic, hardened = np.zeros((len(tets), 3, 3)), np.zeros(len(tets))
+    for x in path:
+        plastic, hardened = plastic_return(turned(x, rest, tets)[1] - I, plastic, hardened, mu, constants)
+    return plastic, hardened
