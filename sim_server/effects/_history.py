@@ -127,12 +127,16 @@ class TetrahedraWithHistory(Tetrahedra):
         return [launch]
 
     def bind_elements(self, **arguments: Any) -> Launch:
-        """Returns the launch that makes forces and tangent of the elements."""
+        """Returns the launch that makes forces and tangent of the elements.
+
+        arguments: those of its own. Without `h` among them the damping of the stiffness does not act on the effect.
+        """
         w = self.world
+        undamped = {"h": w.force_coefficient, "tangent": w.force_coefficient * w.dx_dv, "v": w.predictor}
         launch: Launch = w.backend.module(self.text).bind(
-            "elements", len(self.elements), tets=self.elements, x=w.x, v=w.predictor, gradients=self.gradients,
-            volume=self.volume, shear=self.shear, h=w.force_coefficient, tangent=w.force_coefficient * w.dx_dv,
-            **self.memory, corners=self.corners, edges=self.edges, **arguments,
+            "elements", len(self.elements), tets=self.elements, x=w.x, gradients=self.gradients, volume=self.volume,
+            shear=self.shear, **self.memory, corners=self.corners, edges=self.edges,
+            **(arguments if "h" in arguments else arguments | undamped),
         )  # fmt: skip
         return launch
 

@@ -336,6 +336,7 @@ LAW_ELEMENTS = [
     ("effects/fibres.cu", "FibresElements", "fibres.elements"),
     ("effects/prony.cu", "PronyElements", "prony.elements"),
     ("effects/plasticity.cu", "PlasticElements", "plasticity.elements"),
+    ("effects/damage.cu", "DamageElements", "damage.elements"),
 ]
 LAW_PATCHES = [
     (f"{PATCH_FRAMES[1]}+effects/neo_hookean.cuh", "PatchPressures", "neo_hookean.pressures"),

@@ -80,6 +80,11 @@ SCENES = {
         "solver.precision=mixed",
         "integrator.linearizations=3",
     ),
+    "beam.toml, damage in float32, bdf2": (
+        "object.beam.effects.damage={ strength = 1e4, fracture_energy = 1e5 }",
+        "solver.precision=float32",
+        "integrator.scheme=bdf2",
+    ),
     "springs.toml": (),
     "fibres.toml": ("integrator.scheme=bdf2",),
     "equilibrium.toml": (),

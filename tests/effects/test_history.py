@@ -17,7 +17,8 @@ from tests.scenes import bar, rotation, simulation
 
 TERMS = [{"g": 0.8, "tau": 0.03}, {"g": 0.3, "tau": 0.5}]
 FLOW = {"yield_stress": 60.0, "hardening": 500.0, "kinematic": 300.0}
-EFFECTS: dict[str, dict[str, Any]] = {"prony": {"terms": TERMS}, "plasticity": FLOW}
+TEARS = {"strength": 60.0, "fracture_energy": 3.0}
+EFFECTS: dict[str, dict[str, Any]] = {"prony": {"terms": TERMS}, "plasticity": FLOW, "damage": TEARS}
 FLOOR: dict[str, Any] = {"name": "floor", "shape": "plane"}
 DT = 0.01
 
@@ -28,7 +29,8 @@ def cube(effect: str, name: str = "cube", young: float = 1e5, **table: Any) -> d
 
 
 def made(effect: str, *objects: dict[str, Any], contact: bool = False, **table: Any) -> Simulation:
-    effects: dict[str, Any] = {"gravity": {"g": [0.5, -9.81, 0]}} | ({"contact": True} if contact else {})
+    effects: dict[str, Any] = {"gravity": {"g": table.pop("gravity", [0.5, -9.81, 0])}}
+    effects |= {"contact": True} if contact else {}
     solver = {"preconditioner": "block_jacobi", "tolerance": 1e-9, "max_iterations": 2000} | table.pop("solver", {})
     given = {"name": "test", "dt": DT, "object": list(objects), "effects": effects, "solver": solver, **table}
     return Simulation(Scene.model_validate(given | ({"obstacle": [FLOOR]} if contact else {})))
@@ -41,6 +43,8 @@ def memory_of(sim: Simulation) -> TetrahedraWithHistory:
 def remembered(effect: TetrahedraWithHistory, path: list[NDArray]) -> dict[str, NDArray]:
     """The memory after a path, by the plain reference."""
     rest, tets = effect.world.rest, effect.elements
+    if effect.name == "damage":
+        return {"largest": reference.largest_tension(path, rest, tets)[None]}
     if effect.name == "plasticity":
         constants = FLOW["yield_stress"], FLOW["hardening"], FLOW["kinematic"]
         plastic, hardened = reference.plasticity(path, rest, tets, effect.shear[0], constants)
@@ -75,7 +79,7 @@ ALONE: dict[str, dict[str, Any]] = {
     "newmark, Newton": {"integrator": {"scheme": "newmark", "linearizations": 4}},
     "bdf2": {"integrator": {"scheme": "bdf2"}},
     "generalized_alpha": {"integrator": {"scheme": "generalized_alpha", "linearizations": 3}},
-    "quasi_static": {"integrator": {"scheme": "quasi_static", "linearizations": 6}},
+    "quasi_static": {"integrator": {"scheme": "quasi_static", "linearizations": 6}, "gravity": [0.1, -0.3, 0]},
     "factors": {"solver": {"preconditioner": "cholesky", "update": "every-3"}},
 }
 IN_CONTACT: dict[str, dict[str, Any]] = {

@@ -68,6 +68,8 @@ CASES = {
     "plasticity": Case({"corotational": YOUNG, "plasticity": {"yield_stress": 1e9}},
                        {"bar.plasticity.yield_stress": 700.0, "bar.plasticity.hardening": 1e3,
                         "bar.plasticity.kinematic": 2e3}),
+    "damage": Case({"corotational": YOUNG, "damage": {"strength": 1e6, "fracture_energy": 1e9}},
+                   {"bar.damage.strength": 500.0, "bar.damage.fracture_energy": 100.0}),
     "rayleigh": Case({"corotational": YOUNG, "rayleigh": {"mass": 0.1}},
                      {"bar.rayleigh.mass": 3.0, "bar.rayleigh.stiffness": 0.02}),
     "traction": Case({"corotational": YOUNG, "traction": LOADS},

@@ -93,3 +93,13 @@ def plasticity(path: Iterable[Array], rest: Array, tets: Any, mu: float, constan
     for x in path:
         plastic, hardened = plastic_return(turned(x, rest, tets)[1] - I, plastic, hardened, mu, constants)
     return plastic, hardened
+
+
+def tension(strain: Array) -> Array:
+    """Mazars' equivalent strain, (m,)."""
+    return np.asarray(np.sqrt((np.maximum(np.linalg.eigvalsh(strain), 0) ** 2).sum(axis=1)))
+
+
+def largest_tension(path: Iterable[Array], rest: Array, tets: Any) -> Array:
+    """Largest equivalent strain (m,) at the positions of the path."""
+    return np.asarray(np.max([tension(turned(x, rest, tets)[1] - I) for x in path], axis=0))
