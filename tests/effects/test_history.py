@@ -188,3 +188,29 @@ def test_a_state_turned_as_a_whole_has_turned_forces(effect: str) -> None:
         torque = np.cross(world.x - world.x.mean(axis=0), force @ R.T)
         np.testing.assert_allclose(torque.sum(axis=0), 0, atol=1e-12 * scale)
     np.testing.assert_allclose(found_forces[1], found_forces[0], atol=1e-10 * scale)
+
+
+STARTS: dict[str, Any] = {
+    "stretched": lambda rest, random: rest * [3, 1, 1],
+    "pressed flat": lambda rest, random: rest * [0.1, 1, 1],
+    "all in a point": lambda rest, random: 0 * rest,
+    "inside out": lambda rest, random: rest * [-1, 1, 1],
+    "at random": lambda rest, random: random.uniform(0, 0.2, rest.shape),
+}
+
+
+@pytest.mark.parametrize("start", STARTS)
+@pytest.mark.parametrize("scheme", ["backward_euler", "newmark"])
+@pytest.mark.parametrize("linearizations", [1, 12])
+@pytest.mark.parametrize("effect", EFFECTS)
+def test_nothing_flies_apart_from_anywhere(effect: str, linearizations: int, scheme: str, start: str) -> None:
+    """The matrix is positive definite, forces are numbers, and no energy comes in."""
+    sim = made(
+        effect, cube(effect, young=1e4), integrator={"scheme": scheme, "linearizations": linearizations},
+        gravity=[0, 0, 0],
+    )  # fmt: skip
+    sim.world.x[...] = STARTS[start](sim.world.rest, np.random.default_rng(2))
+    sim.engine.run(60)
+    records = sim.engine.records()
+    assert set(records["status"].tolist()) <= {0, 1, 6}, "solved, or the limit of iterations or linearizations"
+    assert np.isfinite(sim.fetch().x).all()
