@@ -195,6 +195,26 @@ def test_energy_never_grows_and_momenta_stay(scheme: str):
         np.testing.assert_allclose(spins[-1], spins[0], atol=1e-3 * np.abs(spins[0]).max())
 
 
+@pytest.mark.parametrize("scheme", ["newmark", "generalized_alpha"])
+def test_steps_keep_the_order_of_their_scheme(scheme: str):
+    """A bar that swings, in three step sizes: forces are those at the instant for which the scheme solves."""
+
+    def after(steps: int) -> NDArray:
+        table = bar((4, 1, 1), (0.4, 0.1, 0.1), young=1e5, fixed="X < 0.01")
+        table["effects"] |= {"prony": {"terms": [{"g": 1.0, "tau": 0.02}, {"g": 0.5, "tau": 0.3}]}}
+        sim = simulation(
+            table, dt=0.2 / steps, preconditioner="block_jacobi", tolerance=1e-12, max_iterations=3000,
+            integrator={"scheme": scheme, "linearizations": 20, "tolerance": 1e-10},
+        )  # fmt: skip
+        x = sim.world.rest[:, 0]
+        sim.world.v[...] = np.stack([0 * x, 0.5 * x**2, 0.3 * x], axis=1) * sim.world.free[:, None]
+        sim.engine.run(steps)
+        return sim.fetch().x.copy()
+
+    coarse, middle, fine = (after(steps) for steps in (400, 800, 1600))
+    assert np.log2(np.abs(middle - coarse).max() / np.abs(fine - middle).max()) > 1.85
+
+
 def test_a_modulus_is_needed_and_may_be_given():
     with pytest.raises(InputError, match=r"object 'bar', effect prony: nothing beside it has a shear modulus .* shear"):
         simulation(bar(young=None, effects={"prony": {"terms": TERMS}}))
