@@ -26,7 +26,8 @@ had back, that of kinematic hardening too; the rest of the work of flow is in `d
 
 Usual ranges: steel yield_stress 2e8 to 1e9 Pa, hardening a hundredth of young or less; polyethylene 1e7 to 3e7 Pa;
 modelling clay 1e4 to 1e5 Pa. A small yield_stress beside young (below 1e-3) makes thin shear bands, which follow the
-mesh. Strains add up in one frame: good to about 10-20 % of strain, elastic and plastic.
+mesh. Flow keeps the volume, so linear tetrahedra lock in it as they do near Poisson's ratio 0.5: coarse meshes bend too
+little. Strains add up in one frame: good to about 10-20 % of strain, elastic and plastic.
 
 Source: Simo and Hughes, Computational Inelasticity, 1998, section 3.3; Simo and Taylor, Consistent tangent operators
 for rate-independent elastoplasticity, 1985.

@@ -23,7 +23,7 @@ FLOOR: dict[str, Any] = {"name": "floor", "shape": "plane"}
 DT = 0.01
 
 
-def cube(effect: str, name: str = "cube", young: float = 1e5, **table: Any) -> dict[str, Any]:
+def cube(effect: str, name: str = "cube", young: float | None = 1e5, **table: Any) -> dict[str, Any]:
     found = bar((2, 2, 2), (0.2, 0.2, 0.2), name=name, young=young, **table)
     return found | {"effects": found["effects"] | {effect: EFFECTS[effect]}}
 
@@ -102,6 +102,16 @@ def test_memory_follows_the_ends_of_steps_of_bodies_that_touch(effect: str, case
     """They fall on a floor and on each other: paths that enter go back, and islands are solved in passes."""
     upper = cube(effect, "upper", young=2e4, pose={"translate": [0.02, 0.26, 0.01]})
     check_path(made(effect, cube(effect, young=2e4, **TILTED), upper, contact=True, **IN_CONTACT[case]), 40)
+
+
+def test_memory_of_a_body_that_a_refused_solve_sends_back() -> None:
+    """Its law ends at J = 0: the body goes back to where the step before began, and its memory follows."""
+    table = cube("prony", young=None)
+    table["effects"] |= {"neo_hookean": {"young": 1e4, "poisson": 0.3}}
+    sim = made("prony", table)
+    sim.world.v[...] = np.random.default_rng(0).normal(scale=8, size=sim.world.x.shape)
+    check_path(sim, 12)
+    assert (sim.engine.records()["status"] == 5).any(), "a solve was refused"
 
 
 @pytest.mark.parametrize("effect", EFFECTS)
