@@ -117,7 +117,9 @@ class Simulation:
             [*assemble, *integrate], assemble[numbers], euler_launches, settled, effects
         )  # fmt: skip
         parts = [part.launches for part in (stages, euler, substeps) if part]
-        self.step_launches = list({id(x): x for x in (*assemble, *integrate, *(x for p in parts for x in p))}.values())
+        history = [launch for e in effects for launch in e.history()]
+        listed = (*history, *assemble, *integrate, *(x for p in parts for x in p))
+        self.step_launches = list({id(x): x for x in listed}.values())
         contact = ties_alone(w, self.ties) if self.ties else None
         if self.contact:
             contact = self.contact.contact_input()
@@ -125,7 +127,7 @@ class Simulation:
         held = w.reaction if w.reaction.size else None
         return EngineInput(
             assemble, integrate, names, ranges, w.dt, self.scene.solver, self.energies, newton, stages, euler, substeps,
-            contact, touch, held, self.scene.accuracy is not None, arrays,
+            contact, touch, held, self.scene.accuracy is not None, arrays, history,
             self.cutting.cut_input() if self.cutting else None,
         )  # fmt: skip
 
@@ -363,4 +365,6 @@ def build_effects(scene: Scene, world: World) -> dict[str, Effect]:
         built[name].name = name
     if "cutting" in built:
         cast("Cutting", built["cutting"]).check(built)
+    for each in built.values():
+        each.join(list(built.values()))
     return built

@@ -335,6 +335,7 @@ class EngineInput:
     held: (bodies, k, 6) force [N] and torque [N m] on each holder, attachment and spring; None: there are none
     errors: whether the estimated errors of positions are wanted where they cost time
     arrays: of the system by name: row_start, columns, values, b, y, x, v, clock, moving, rotation
+    history: launches that begin every step, once, whatever attempts, trials or stages it takes
     cut: of bodies that may lose elements; None: no object lists the effect
     """
 
@@ -354,7 +355,8 @@ class EngineInput:
     held: Float64 | None
     errors: bool
     arrays: Mapping[str, NDArray[Any]]
-    cut: CutInput | None = None
+    history: Sequence[Launch] = ()
+    cut: "CutInput | None" = None
 
 
 @dataclass(frozen=True)

@@ -95,6 +95,17 @@ class Effect:
         """
         return []
 
+    def join(self, others: Sequence["Effect"]) -> None:
+        """Called once all effects of the scene are built, these, before any launches are made. Raises InputError."""
+
+    def history(self) -> list[Launch]:
+        """Launches that advance what the material remembers by the step that has ended, from where it has ended.
+
+        They begin every step, once, before all other launches, so that attempts, trials of a search and passes of
+        contact find the memory as the last step has left it. A body that was frozen has not moved: they leave it out.
+        """
+        return []
+
     def force_launches(self, system: System, stencil: Stencil | None, frames: bool) -> list[Launch] | None:
         """Launches that add its forces alone to system.b, and what else it adds to .diagonal; None if it has none such.
 

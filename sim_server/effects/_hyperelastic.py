@@ -182,13 +182,13 @@ class Tetrahedra(Effect):
 
     def packed(self, law: Law) -> Float64:
         """Returns the constants (k, m) in the form of the kernel text, which follow the scene."""
-
-        def compute(scene: Scene) -> Float64:
-            packed = [np.stack(law.pack(values)) for values in self.values_in(scene, law)]
-            return np.asarray(np.concatenate(packed, axis=1)[:, self.order])
-
-        constants: Float64 = self.world.follow(law.name, compute=compute)
+        constants: Float64 = self.world.follow(law.name, compute=partial(self.packed_in, law))
         return constants
+
+    def packed_in(self, law: Law, scene: Scene) -> Float64:
+        """Returns the constants (k, m) in the form of the kernel text by the parameters of a scene."""
+        packed = [np.stack(law.pack(values)) for values in self.values_in(scene, law)]
+        return np.asarray(np.concatenate(packed, axis=1)[:, self.order])
 
     def _of_a_step(self) -> dict[str, Any]:
         """Arguments of the integrator: coefficients of force and tangent, and the field that the tangent multiplies."""

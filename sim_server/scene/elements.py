@@ -17,6 +17,9 @@ LAWS = ("arruda_boyce", "costa", "mooney_rivlin", "neo_hookean", "ogden", "stabl
 PATCHED = ("arruda_boyce", "mooney_rivlin", "neo_hookean", "stable_neo_hookean", "veronda_westmann")  # may be "patch"
 
 
+REMEMBERING = ("damage", "plasticity", "prony")  # beside laws of linear tetrahedra
+
+
 class HasElements(Protocol):
     """An object of a scene, as far as its elements go."""
 
@@ -59,6 +62,8 @@ def _reason(elements: Elements, effects: Mapping[str, Any], integrator: Integrat
     """Returns why an object cannot have such elements, other than linear ones; empty if it may."""
     if "cutting" in effects:
         return 'with the effect cutting, which removes linear elements alone; allowed: "auto", "linear"'
+    if found := [name for name in REMEMBERING if name in effects]:
+        return f'with the effect {found[0]}, which has linear elements alone; allowed: "auto", "linear"'
     laws = [name for name in LAWS if name in effects]
     if linear := [name for name in laws if name not in PATCHED]:
         return f'with the effect {linear[0]}, which has linear elements alone; allowed: "auto", "linear"'

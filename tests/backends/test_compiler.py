@@ -334,6 +334,9 @@ LAW_ELEMENTS = [
     (f"{FRAME}+effects/mooney_rivlin.cuh", "HyperelasticElements", "mooney_rivlin.elements"),
     (f"{PATCH_FRAMES[0]}+effects/neo_hookean.cuh", "HyperelasticPatchElements", "neo_hookean.elements"),
     ("effects/fibres.cu", "FibresElements", "fibres.elements"),
+    ("effects/prony.cu", "PronyElements", "prony.elements"),
+    ("effects/plasticity.cu", "PlasticElements", "plasticity.elements"),
+    ("effects/damage.cu", "DamageElements", "damage.elements"),
 ]
 LAW_PATCHES = [
     (f"{PATCH_FRAMES[1]}+effects/neo_hookean.cuh", "PatchPressures", "neo_hookean.pressures"),

@@ -69,6 +69,25 @@ SCENES = {
     "beam.toml, cut": ("object.beam.effects.cutting=true", "solver.precision=mixed"),
     "fibres.toml, cut in float32": ("object.beam.effects.cutting.removed='3-7'", "solver.precision=float32"),
     "springs.toml, cut": ("object.block.effects.cutting=true", "integrator.scheme=bdf2"),
+    "beam.toml, prony in float32": (
+        "object.beam.effects.prony.terms=[{ g = 0.5, tau = 0.1 }, { g = 0.2, tau = 1 }]",
+        "solver.precision=float32",
+    ),
+    "beam.toml, prony, mixed, Newton": (
+        "object.beam.effects.prony.terms=[{ g = 0.5, tau = 0.1 }]",
+        "solver.precision=mixed",
+        "integrator.linearizations=3",
+    ),
+    "beam.toml, plasticity, mixed, Newton": (
+        "object.beam.effects.plasticity.yield_stress=1e3",
+        "solver.precision=mixed",
+        "integrator.linearizations=3",
+    ),
+    "beam.toml, damage in float32, bdf2": (
+        "object.beam.effects.damage={ strength = 1e4, fracture_energy = 1e5 }",
+        "solver.precision=float32",
+        "integrator.scheme=bdf2",
+    ),
     "springs.toml": (),
     "fibres.toml": ("integrator.scheme=bdf2",),
     "equilibrium.toml": (),
@@ -119,6 +138,20 @@ def test_launches_over_cells_and_patches_are_put_together_by_domain(cupy, tangen
     alone = {"measure", "means", "elements", "exact_elements", "gather", "gradients", "own_blocks", "blocks"}
     assert not (alone | {"gather_impulses", "gather_twists", "twist_blocks"}) & set(names)
     assert names[: names.index("pcg")].count("fused") >= 6
+
+
+def test_memory_advances_once_a_step_between_the_energy_balance_and_the_elements(cupy):
+    """A body that the balance freezes has no memory to advance."""
+    keys = ["object.beam.effects.prony.terms=[{ g = 0.5, tau = 0.1 }]", "integrator.linearizations=3"]
+    simulation = Simulation.load("deploy/scenes/beam.toml", keys, "gpu")
+    cupy.calls.clear()
+    simulation.engine.assemble()
+    names = [kernel for kernel, _ in cupy.calls]
+    assert names.count("advance") == 1
+    assert names.index("energy_balance") < names.index("advance") < names.index("fused")
+    cupy.calls.clear()
+    simulation.engine.solve()
+    assert "advance" not in [kernel for kernel, _ in cupy.calls]
 
 
 def written_back(simulation):

@@ -87,7 +87,8 @@ def allowed(field: FieldInfo) -> str:
     high = next((b for b in given if isinstance(b, Le | Lt)), None)
     if lengths := [b for b in given if isinstance(b, MinLen | MaxLen)]:
         least = next(b.min_length for b in lengths if isinstance(b, MinLen))
-        return f"{least} to {next(b.max_length for b in lengths if isinstance(b, MaxLen))} characters"
+        most = next(b.max_length for b in lengths if isinstance(b, MaxLen))
+        return f"{least} to {most} {'of them' if get_origin(kind) is tuple else 'characters'}"
     if isinstance(low, Ge) and isinstance(high, Le):
         return f"{number(low.ge)} to {number(high.le)}"
     words = []

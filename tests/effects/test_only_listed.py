@@ -65,6 +65,10 @@ SCENES = {  # lines of the scene and of its object, effects listed, texts that r
         "", "neo_hookean = { young = 1e5, poisson = 0.3 }\n", ["neo_hookean"],
         ["neo_hookean", "gather_forces", "gather_blocks", "shape_matching"], [],
     ),
+    "a memory": (
+        "", COROTATIONAL + "prony = { terms = [{ g = 0.5, tau = 0.1 }] }\n", ["corotational", "prony"],
+        ["corotational", "prony", "gather_forces", "gather_blocks"], ["shape_matching", "plasticity", "damage"],
+    ),
     "contact": (
         'contact = true\n[[obstacle]]\nname = "floor"\nshape = "plane"', COROTATIONAL, ["contact", "corotational"],
         ["contact", "corotational"], ["signed_distance", *OTHERS],

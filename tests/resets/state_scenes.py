@@ -24,7 +24,14 @@ def cube(name: str = "cube", x: float = 0.0, y: float = 0.001, **keys: Any) -> d
 
 
 def beam(**keys: Any) -> dict[str, Any]:
-    return bar(cells=(4, 1, 1), size=(0.4, 0.1, 0.1), name="beam", fixed="X < 0.01", touch=True, young=3e5, **keys)
+    return bar(
+        cells=(4, 1, 1), size=(0.4, 0.1, 0.1), fixed="X < 0.01", touch=True, young=3e5, **{"name": "beam"} | keys
+    )
+
+
+def remembering(body: dict[str, Any], effects: dict[str, Any]) -> dict[str, Any]:
+    """The same body with effects that have a memory."""
+    return body | {"effects": body["effects"] | effects}
 
 
 def halves() -> list[dict[str, Any]]:
@@ -46,6 +53,9 @@ LAWS = {
     "neo_hookean": {"young": 3e5, "poisson": 0.4}, "mass_spring": {"young": 1e5}, "fixed": {"where": "X < 0.01"},
     "touch": True,
 }  # fmt: skip
+VISCOUS = {"prony": {"terms": [{"g": 0.8, "tau": 0.05}, {"g": 0.3, "tau": 1.0}], "shear": 1e5}}
+FLOWING = {"plasticity": {"yield_stress": 300.0, "hardening": 1e3}}
+TEARING = {"damage": {"strength": 500.0, "fracture_energy": 1.0}}
 MIXED = bar(cells=(2, 2, 2), size=(0.2, 0.2, 0.2), name="cube", density=1000, young=None) | {"effects": LAWS}
 SCENES: dict[str, dict[str, Any]] = {
     "laws": table([beam(tangent="exact"), MIXED]),
@@ -60,6 +70,18 @@ SCENES: dict[str, dict[str, Any]] = {
     "friction": table([cube(), cube("next", x=0.21)], obstacle=[SLOPE, TOOL]),
     "friction, bdf2": table([cube()], obstacle=[SLOPE, TOOL], integrator={"scheme": "bdf2"}),
     "attached": table(halves(), attachment=[WEAK]),
+    "prony": table(
+        [remembering(beam(), VISCOUS), beam(name="other", pose={"translate": [0, 0, 1]})], integrator=NEWTON
+    ),
+    "prony, friction, bdf2": table(
+        [remembering(cube(), VISCOUS), remembering(cube("next", x=0.15, y=0.21), VISCOUS)],
+        obstacle=[SLOPE, TOOL],
+        integrator={"scheme": "bdf2"},
+    ),
+    "plasticity": table([remembering(beam(), FLOWING), beam(name="other", pose={"translate": [0, 0, 1]})]),
+    "damage": table(
+        [remembering(beam(), TEARING), beam(name="other", pose={"translate": [0, 0, 1]})], integrator=NEWTON
+    ),
     "held": table(
         [beam()], holder=[{"name": "hand", "object": "beam", "where": "X > 0.39", "moved": "client", "max_speed": 0.5}]
     ),

@@ -27,6 +27,8 @@ MODELS: dict[str, dict[str, Any]] = {
     "Mooney-Rivlin": {"mooney_rivlin": {"c1": 5e4, "c2": 2e4, "bulk": 5e5}},
     "Arruda-Boyce": {"arruda_boyce": {"shear": 1.4e5, "segments": 8.0, "bulk": 5e5}},
     "Ogden": {"ogden": {"mu": [1.4e5], "alpha": [3.0], "bulk": 5e5}},
+    "prony": {"corotational": USUAL, "prony": {"terms": [{"g": 2.0, "tau": 0.1}]}},
+    "plasticity": {"corotational": USUAL, "plasticity": {"yield_stress": 1e3, "hardening": 1e4}},
     "fibres": {"neo_hookean": USUAL, "fibres": {"stiffness": 2e5, "direction": [1, 0.5, 0]}},
 }  # fmt: skip
 POSE = (40.0, 0.0, 70.0)

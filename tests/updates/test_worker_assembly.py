@@ -25,6 +25,14 @@ SOLIDS = {
     "regions": bar((4, 2, 2), young=[{"where": "X < 1", "young": 1e6}, {"young": 1e4}], fixed="X < 0.01"),
     "posed": bar((4, 2, 2), pose={"rotate": [40, 0, 70], "translate": [1, 2, 3]}, fixed="X < 0.01"),
     "springs": {"name": "bar", "mesh": {"bar": [4, 2, 2], "size": [2, 1, 1], "split": "kuhn"}, "effects": SPRINGS},
+    "a memory, which is not in the matrix": bar(
+        (4, 2, 2),
+        young=None,
+        effects={
+            "corotational": {"young": 1e5, "poisson": 0.3},
+            "prony": {"terms": [{"g": 0.5, "tau": 0.1}]},
+        },
+    ),
     "equal masses": bar((4, 2, 2), mass=5.0, masses="equal"),
 }
 

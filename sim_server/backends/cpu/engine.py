@@ -432,7 +432,9 @@ class CpuEngine(Reports):
     def __init__(self, given: EngineInput, records: int = 8192, frames: int = 8):
         self._native = _library()
         others = [part.launches for part in (given.stages, given.euler, given.substeps) if part]
-        listed = cast(list[CpuLaunch], [*given.assemble, *given.integrate, *(x for part in others for x in part)])
+        listed = cast(
+            list[CpuLaunch], [*given.assemble, *given.integrate, *(x for part in others for x in part), *given.history]
+        )
         launches = list({id(launch): launch for launch in listed}.values())  # some take part in several stages
         arrays, ranges = given.arrays, given.ranges
         nodes, bodies = len(arrays["x"]), len(ranges)
@@ -464,6 +466,8 @@ class CpuEngine(Reports):
             late = [x.domain == "blocks" and given.held is None for x in given.assemble]  # holders take forces from A
             self._newton = _NativeNewton(given.newton, late, loop, self._launch)
         number = {id(launch): k for k, launch in enumerate(launches)}
+        self._history = np.array([number[id(launch)] for launch in given.history], np.int32)
+        loop.history, loop.histories, loop.advanced = self._history.ctypes.data, len(self._history), -1
         self._stages = given.stages and _NativeStages(given.stages, loop, self._launch, number)
         self._euler = given.euler and _NativeEuler(given.euler, loop, self._launch, number)
         self._substeps = given.substeps and _NativeSubsteps(given.substeps, loop, number)
@@ -566,7 +570,7 @@ class CpuEngine(Reports):
 
     def resume(self, step: int, start_time: float) -> None:
         """Goes on from a state that was written, after `step` steps."""
-        self.loop.step, self.loop.start_time, self._begun = step, start_time, True
+        self.loop.step, self.loop.start_time, self.loop.advanced, self._begun = step, start_time, -1, True
         for cut in self._cut.values():
             cut.native.start_time = start_time
         for entry in self._body:

@@ -88,6 +88,7 @@ class GpuEngine(DeviceLoop):
     def __init__(self, gpu: Gpu, given: EngineInput, records: int = 8192):
         assemble, integrate = (cast(Sequence[DeviceLaunch], part) for part in (given.assemble, given.integrate))
         self.launches, self._first = [*assemble, *integrate], assemble[: leading(assemble)]
+        self._history = cast(Sequence[DeviceLaunch], given.history)
         assemble, settled = assemble[len(self._first) :], integrate[: leading(integrate)]
         integrate = integrate[len(settled) :]
         substep_forces: Sequence[DeviceLaunch] = ()  # which a step evaluates many times
@@ -342,13 +343,14 @@ class GpuEngine(DeviceLoop):
         readers: later ones that read what it makes.
 
         The balance is the prologue of a kernel over elements, since these write nothing that it reads. If it freezes a
-        body meanwhile, the element results of this body do not matter, since its nodes are fixed then.
+        body meanwhile, the element results of this body do not matter, since its nodes are fixed then. What advances
+        the history of materials comes after the balance: a frozen body has none.
         """
         domains = {launch.domain for launch in assemble}
-        elements = "elements" in domains and domains <= set(DOMAINS) and not self._first  # which change v
+        elements = "elements" in domains and domains <= set(DOMAINS) and not (self._first or self._history)
         launches = fuse(assemble, prologue=self._energies.prologue if elements else None, after=after, readers=readers)
         if not elements:
-            return [self._energies.launch_balance, *self._first, *launches]
+            return [self._energies.launch_balance, *self._history, *self._first, *launches]
         first = launches[0]
         assert isinstance(first, FusedKernel)
         self._energies.threads = first.shape.threads

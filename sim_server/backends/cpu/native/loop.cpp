@@ -188,12 +188,20 @@ static void assemble_single(Loop& loop, bool whole) {
         if (needs_matrix(i)) note_changes(loop.body[i].correction, loop.rings.step, loop.body[i].steps == 0);
 }
 
+// Advances the history of materials to the positions at which the last step ended.
+static void advance_history(Loop& loop) {
+    if (loop.advanced == loop.rings.step) return;
+    for (int k = 0; k < loop.histories; ++k) run(loop.launch[loop.history[k]], loop.threads);
+    loop.advanced = loop.rings.step;
+}
+
 // whole: A of all bodies is wanted.
 static void assemble(Loop* loop, bool whole) {
     double begin = now();
     Rings& rings = loop->rings;
     loop->cpu_begin = thread_time();
     take_changes(*loop);
+    advance_history(*loop);
     loop->clock[0] = rings.start_time + rings.step * rings.dt;
     for (int i = 0; i < loop->bodies; ++i) {
         take_orders(loop->body[i]);
