@@ -119,7 +119,7 @@ class Effect:
         """Returns arrays that the energy balance of a step reads, by their names in backends.energies; {} for most.
 
         gravity: acceleration (3,) [m/s2]. force (n, 3) [N], spring (n,) [N/m], anchor (n, 3) [m]: of pushes and grabs.
-        load (n, 3): of surfaces [N].
+        load (n, 3): of all loads [N] (_loads.py).
         """
         return {}
 

@@ -20,6 +20,10 @@ STRETCHED = {"direction": [[1, 0, 0], [0, 1, 0]]}
 LOADS = {"where": "X > 1.49", "force": [0, 30, 0], "stress": [5, 0, 0], "pressure": 40.0, "moment": [0, 9, 3]}
 
 
+BEATS = {"stress": 3e4, "direction": [1, 1, 0], "activation": 0.7, "period": 0.1, "phase": 0.2, "duty": 0.8,
+         "optimum": 1.1, "width": 0.6}  # fmt: skip
+
+
 class Case(NamedTuple):
     """A bar with effects, and what is set. `start` says that it is set before the first step, since what follows
     depends on more than positions and velocities."""
@@ -68,6 +72,8 @@ CASES = {
     "traction": Case({"corotational": YOUNG, "traction": LOADS},
                      {"bar.traction.force": [9, 3, 0], "bar.traction.stress": [0, 90, 0],
                       "bar.traction.pressure": -60.0, "bar.traction.moment": [0, 4, -5]}),
+    "muscle": Case({"corotational": YOUNG, "muscle": {"stress": 2e4, "direction": [1, 0, 0]}},
+                   {f"bar.muscle.{key}": value for key, value in BEATS.items()}, start=True),
     "gravity": law("corotational", YOUNG)._replace(values={"gravity.g": [4.0, 1.0, 0.0]}),
     "friction": Case({"corotational": YOUNG}, {"bar.friction": 0.2, "floor.friction": 0.1, "wall.friction": 0.3,
                      "contact.friction": [PAIR | {"value": 0.9}], "gravity.g": [1, -9, 0]}, CONTACT, True),

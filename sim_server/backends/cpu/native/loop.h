@@ -147,7 +147,7 @@ struct Energies {                      // energy.h
     const double* mass;                // (nodes,) [kg]
     const double* before;              // (nodes, 3) x when the step began [m]
     double *force, *spring, *anchor;   // of hands (effects/touch.cu); null: nothing can be touched
-    const double* load;                // (nodes, 3) of surfaces (effects/traction.cu), or null
+    const double* load;                // (nodes, 3) of the effects with loads (effects/_loads.py), or null
     double* free;                      // (nodes,) 0 from when a body is frozen
     double** still;                    // arrays (nodes, 3) that are 0 then
     Elastic* elastic;

@@ -1,0 +1,52 @@
+# SPDX-License-Identifier: MIT
+"""Scenes with loads are built for a GPU where there is none: texts compile with the options of a run."""
+
+import sys
+from typing import Any
+
+import pytest
+
+from sim_server.backends.gpu import device
+from sim_server.backends.gpu import engine as gpu_engine
+from sim_server.backends.gpu.inverse.workspace import workspace
+from sim_server.backends.gpu.kernel_fusion import DOMAINS
+from sim_server.simulation import Simulation
+from tests.backends import fake_cupy
+from tests.scenes import bar, scene
+from tests.support import nvrtc
+
+pytestmark = pytest.mark.slow
+LOADS: dict[str, tuple[dict[str, Any], set[str]]] = {  # effects of an object, and launches that they have
+    "muscle": (
+        {"muscle": {"stress": 1e4, "direction": [1, 0, 0], "period": 0.5}}, {"muscle.elements", "muscle_load.load"},
+    ),
+}  # fmt: skip
+SCHEMES = [("backward_euler", "mixed"), ("ros2", "float64"), ("central_difference", "float32")]
+
+
+@pytest.fixture(autouse=True)
+def cupy(tmp_path, monkeypatch):
+    if (library := nvrtc.library()) is None:
+        pytest.skip("needs the package nvidia-cuda-nvrtc")
+    fake = fake_cupy.made(tmp_path, library)
+    monkeypatch.setitem(sys.modules, "cupy", fake)
+    monkeypatch.setattr(gpu_engine, "CudaDevice", fake_cupy.Device)
+    for function in (device.cupy, device.processors, workspace):
+        function.cache_clear()
+    yield fake
+    for function in (device.cupy, device.processors, workspace):
+        function.cache_clear()
+
+
+@pytest.mark.parametrize(("scheme", "precision"), SCHEMES)
+def test_loads_are_built(cupy, scheme, precision):
+    """All of them in one scene, whose launches join the kernels over elements, nodes and blocks."""
+    given = bar((2, 1, 1), fixed="X < 0.01")
+    given["effects"] |= {name: params for effects, _ in LOADS.values() for name, params in effects.items()}
+    given["effects"]["traction"] = {"where": "X > 1.99", "pressure": 2.0}
+    sim = Simulation(scene(given, integrator={"scheme": scheme}, precision=precision), "gpu")
+    sim.engine.run(3)
+    assert sim.engine.step == 3
+    names = {x.name for x in sim.step_launches}
+    assert {"traction.load"}.union(*(launches for _, launches in LOADS.values())) <= names
+    assert all(x.domain in DOMAINS for x in sim.step_launches if x.name in names and x.name.split(".")[0] in LOADS)
