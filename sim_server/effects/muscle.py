@@ -19,7 +19,7 @@ then multiplied by
 which rises from 0 to 1 and falls to 0 within the part `duty` of the period, with a slope of 0 at both ends. t is the
 time at the end of the step in implicit schemes of one stage (in generalized_alpha that at which forces balance), and
 the middle of the step in ros2 and with explicit substeps, where it is of order 2 as a mean. A `period` that changes
-while steps run leaves t as it is, so the phase jumps.
+while steps run leaves t as it is, so the phase jumps; so does a reset, after which beats go on.
 
 `stress` may be a list of regions { where, stress, direction, activation, period, phase, duty, optimum, width }: so
 directions vary over a body, parts are activated one by one, and phases make waves.

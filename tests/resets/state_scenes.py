@@ -47,7 +47,9 @@ LAWS = {
     "touch": True,
 }  # fmt: skip
 MIXED = bar(cells=(2, 2, 2), size=(0.2, 0.2, 0.2), name="cube", density=1000, young=None) | {"effects": LAWS}
-BEATING = {"muscle": {"stress": 5e4, "direction": [1, 0, 0], "period": 0.1}}
+LOADS = {
+    "muscle": {"stress": 5e4, "direction": [1, 0, 0]}, "traction": {"where": "X > 0.39", "pressure": 100.0},
+}  # fmt: skip
 SCENES: dict[str, dict[str, Any]] = {
     "laws": table([beam(tangent="exact"), MIXED]),
     "newton": table([beam()], integrator=NEWTON),
@@ -61,7 +63,7 @@ SCENES: dict[str, dict[str, Any]] = {
     "friction": table([cube(), cube("next", x=0.21)], obstacle=[SLOPE, TOOL]),
     "friction, bdf2": table([cube()], obstacle=[SLOPE, TOOL], integrator={"scheme": "bdf2"}),
     "attached": table(halves(), attachment=[WEAK]),
-    "beating": table([beam() | {"effects": beam()["effects"] | BEATING}]),
+    "loaded": table([beam() | {"effects": beam()["effects"] | LOADS}]),
     "held": table(
         [beam()], holder=[{"name": "hand", "object": "beam", "where": "X > 0.39", "moved": "client", "max_speed": 0.5}]
     ),

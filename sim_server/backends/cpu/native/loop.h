@@ -167,6 +167,7 @@ struct Loop {
     const int32_t* row_start;
     const int32_t* columns;
     const double* values;
+    const RankOne* rank_one;           // parts of A beside its blocks, or null
     const double* b;                   // (nodes, 3) right-hand side in the material frame
     double* y;                         // (nodes, 3) start in, solution out
     double* x;                         // (nodes, 3) for frames
@@ -191,5 +192,5 @@ struct Loop {
 };
 
 static BlockCsr matrix_of(const Loop& loop, const Body& body) {
-    return {body.first, body.last, loop.row_start, loop.columns, loop.values};
+    return {body.first, body.last, loop.row_start, loop.columns, loop.values, nullptr, loop.rank_one, (int)(&body - loop.body)};
 }
