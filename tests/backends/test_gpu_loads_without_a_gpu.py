@@ -19,6 +19,7 @@ from tests.support import nvrtc
 
 pytestmark = pytest.mark.slow
 OPEN = {"where": f"{INSIDE} and X > 0.3", "pressure": 3.0, "lids": True}
+PATH = [[0, 0, 0], [0.5, 0, 0], [1, 0, 0], [1, 1, 1]]
 LOADS: dict[str, tuple[dict[str, Any], set[str]]] = {  # effects of an object, and launches that they have
     "muscle": (
         {"muscle": {"stress": 1e4, "direction": [1, 0, 0], "period": 0.5}}, {"muscle.elements", "muscle_load.load"},
@@ -26,6 +27,10 @@ LOADS: dict[str, tuple[dict[str, Any], set[str]]] = {  # effects of an object, a
     "cavity": (
         {"cavity": [{"where": INSIDE, "pressure": 9.0}, OPEN]},
         {f"cavity.{name}" for name in ("lids", "walls", "chunks", "slopes", "pressures", "load")},
+    ),
+    "cable": (
+        {"cable": [{"path": PATH, "tension": 9.0}, {"path": PATH[::2], "stiffness": 1e3, "shortening": 0.1}]},
+        {"cable.segments", "cable.tensions", "cable.guides"},
     ),
 }  # fmt: skip
 SCHEMES = [("backward_euler", "mixed"), ("ros2", "float64"), ("central_difference", "float32")]

@@ -29,6 +29,9 @@ BEATS = {"stress": 3e4, "direction": [1, 1, 0], "activation": 0.7, "period": 0.1
          "optimum": 1.1, "width": 0.6}  # fmt: skip
 
 
+PATH = [[0.0, 0.0, 0.0], [0.5, 0.5, 0.0], [1.0, 0.5, 0.5], [1.5, 0.0, 0.5]]
+
+
 class Case(NamedTuple):
     """A bar with effects, and what is set. `start` says that it is set before the first step, since what follows
     depends on more than positions and velocities."""
@@ -87,6 +90,11 @@ CASES = {
                    {"bar.cavity.volume": 0.13}),
     "cavities": Case({"corotational": YOUNG, "cavity": [{"where": INSIDE, "pressure": 90.0}]},
                      {"bar.cavity.tables": [{"where": INSIDE, "pressure": -30.0}]}),
+    "cable": Case({"corotational": YOUNG, "cable": {"path": PATH, "tension": 40.0}}, {"bar.cable.tension": 90.0}),
+    "cable drawn in": Case({"corotational": YOUNG, "cable": {"path": PATH, "stiffness": 1e4, "shortening": 0.0}},
+                           {"bar.cable.shortening": 0.02}),
+    "cables": Case({"corotational": YOUNG, "cable": [{"path": PATH, "tension": 40.0}]},
+                   {"bar.cable.tables": [{"path": PATH, "tension": 9.0}]}),
     "gravity": law("corotational", YOUNG)._replace(values={"gravity.g": [4.0, 1.0, 0.0]}),
     "friction": Case({"corotational": YOUNG}, {"bar.friction": 0.2, "floor.friction": 0.1, "wall.friction": 0.3,
                      "contact.friction": [PAIR | {"value": 0.9}], "gravity.g": [1, -9, 0]}, CONTACT, True),
