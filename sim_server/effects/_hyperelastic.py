@@ -56,10 +56,10 @@ from sim_server.arrays import Float64, Int32
 from sim_server.backends.base import Launch
 from sim_server.backends.energies import ElementEnergies
 from sim_server.effects._base import Effect, PerBody, Refusal
+from sim_server.effects._rest_shape import RestShape
 from sim_server.errors import InputError
 from sim_server.mechanics.system import Stencil, System
 from sim_server.mechanics.world import Body, World
-from sim_server.mesh.shape_functions import shape_gradients
 from sim_server.scene import Scene
 from sim_server.scene.live import POISSON, STIFFNESS, Live
 from sim_server.scene.parameters import Parameters, Positive
@@ -165,10 +165,15 @@ class Tetrahedra(Effect):
         counts = [len(body.mesh.tets) for body, _ in listed]
         self.owner = np.repeat([body.index for body, _ in listed], counts)[self.order]
         self.number = np.concatenate([np.arange(n) for n in counts])[self.order]
-        self.volume, gradients = shape_gradients(world.rest, self.elements)
-        self.gradients = np.ascontiguousarray(gradients.reshape(-1, 9).T)
+        self.rest = RestShape(world, self.bodies, self.elements, self.order)
+        self.volume = self.rest.followed(world, self.rest.volume)
+        self.gradients = self.rest.followed(world, self._gradients)
         self.corners, self.edges = np.zeros((4, m, 9)), np.zeros((6, m, 9))
         self._energy = np.zeros(m)
+
+    def _gradients(self, scene: Scene) -> Float64:
+        """Returns gradients (9, m)."""
+        return self.rest.gradients(scene).reshape(-1, 9).T
 
     def values_in(self, scene: Scene, law: Law) -> list[Values]:
         """Returns the constants of each body's elements by the parameters of a scene. Raises InputError."""
@@ -215,15 +220,16 @@ class Hyperelastic(Tetrahedra):
         self.constants = self.packed(law)
         self.elastic = world.at_start(self.elastic_in)
         if law.axes is not None:
-            self.gradients = world.follow(law.name, compute=partial(self._gradients_along, law.axes, self.gradients))
+            along = partial(self._gradients_along, law.axes)
+            self.gradients = world.follow(law.name, *self.rest.of, compute=along)
         floors = [getattr(p, "floor", 0.0) if getattr(p, "inversion", "") == "regularize" else 0.0 for _, p in listed]
         self.floor = np.repeat(floors, [len(body.mesh.tets) for body, _ in listed])[self.order]
         self.refused = np.tile([-1.0, 0.0], (len(self.elements), 1))
 
-    def _gradients_along(self, axes_of: Callable[[Values], Float64], gradients: Float64, scene: Scene) -> Float64:
+    def _gradients_along(self, axes_of: Callable[[Values], Float64], scene: Scene) -> Float64:
         """Returns gradients (9, m) by the material axes."""
         axes = np.concatenate([axes_of(values) for values in self.values_in(scene, self.law)])[self.order]
-        rows = gradients.T.reshape(-1, 3, 3) @ axes
+        rows = self.rest.gradients(scene) @ axes
         return np.asarray(rows.reshape(-1, 9).T)
 
     def elastic_in(self, scene: Scene) -> Mapping[int, tuple[Float64, Float64]]:

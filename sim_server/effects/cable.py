@@ -17,7 +17,8 @@ The stiffness matrix is positive semi-definite and complete: T / l (I - e e^T) o
 length l, and k g g^T, which couples every two nodes of a cable with a stiffness. So a path has at most 64 points. A
 kink of T where a cable becomes slack is left to the steps.
 
-Usual ranges: tendons of fingers 1 to 100 N, of soft arms 0.5 to 20 N; k 1e3 to 1e6 N/m, steel wire of 1 mm and 1 m 1.5e5.
+Usual ranges: tendons of fingers 1 to 100 N, of soft arms 0.5 to 20 N; k 1e3 to 1e6 N/m (1 m of
+steel wire of 1 mm: 1.5e5).
 
 Sources: Camarillo et al., Mechanics modeling of tendon-driven continuum manipulators, IEEE Transactions on Robotics 24,
 2008; Servin, Lacoursiere, Nordfelth and Bodin, Hybrid, multiresolution wires with massless frictional contacts, IEEE

@@ -32,6 +32,7 @@ LOADS: dict[str, tuple[dict[str, Any], set[str]]] = {  # effects of an object, a
         {"cable": [{"path": PATH, "tension": 9.0}, {"path": PATH[::2], "stiffness": 1e3, "shortening": 0.1}]},
         {"cable.segments", "cable.tensions", "cable.guides"},
     ),
+    "growth": ({"growth": {"expansion": 1e-3, "amount": 10.0}}, set()),
 }  # fmt: skip
 SCHEMES = [("backward_euler", "mixed"), ("ros2", "float64"), ("central_difference", "float32")]
 

@@ -44,7 +44,7 @@ def test_every_model_and_every_situation_is_among_those_tested() -> None:
 
 
 def test_every_effect_with_elements_is_a_model_of_the_hard_cases() -> None:
-    others = {"cable", "cavity", "contact", "fixed", "gravity", "muscle", "rayleigh", "touch", "traction"}
+    others = {"cable", "cavity", "contact", "fixed", "gravity", "growth", "muscle", "rayleigh", "touch", "traction"}
     assert {model.effect for model in MODELS.values()} == set(known_effects()) - others
 
 

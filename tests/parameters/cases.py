@@ -90,6 +90,12 @@ CASES = {
                    {"bar.cavity.volume": 0.13}),
     "cavities": Case({"corotational": YOUNG, "cavity": [{"where": INSIDE, "pressure": 90.0}]},
                      {"bar.cavity.tables": [{"where": INSIDE, "pressure": -30.0}]}),
+    "growth": Case({"corotational": YOUNG, "growth": {"expansion": 0.1}},
+                   {"bar.growth.expansion": [0.2, 0.1, 0], "bar.growth.amount": 0.5}),
+    "growth of a law": Case(
+        {"neo_hookean": YOUNG, "fibres": {"stiffness": 2e4} | STRETCHED, "growth": {"expansion": 0.1}},
+        {"bar.growth.amount": 2.0},
+    ),
     "cable": Case({"corotational": YOUNG, "cable": {"path": PATH, "tension": 40.0}}, {"bar.cable.tension": 90.0}),
     "cable drawn in": Case({"corotational": YOUNG, "cable": {"path": PATH, "stiffness": 1e4, "shortening": 0.0}},
                            {"bar.cable.shortening": 0.02}),
