@@ -54,7 +54,7 @@ LAW = Law(
     (
         Constant("expansion", Annotated[Vector, BeforeValidator(_three)],
                  "strain, or [x, y, z], of an amount of 1 [-], or a list of regions", live=Live()),
-        Constant("amount", float, "that the expansion is multiplied by: a difference of temperature, or a part [-]", 1.0,
+        Constant("amount", float, "that expansion is multiplied by: a difference of temperature, or a part [-]", 1.0,
                  live=Live(0, 1)),
     ),
     pack=lambda values: [values["amount"]],

@@ -18,6 +18,7 @@ from tests.scenes import scene
 from tests.support import nvrtc
 
 pytestmark = pytest.mark.slow
+G = (0.0, -9.81, 0.0)
 OPEN = {"where": f"{INSIDE} and X > 0.3", "pressure": 3.0, "lids": True}
 PATH = [[0, 0, 0], [0.5, 0, 0], [1, 0, 0], [1, 1, 1]]
 LOADS: dict[str, tuple[dict[str, Any], set[str]]] = {  # effects of an object, and launches that they have
@@ -33,6 +34,8 @@ LOADS: dict[str, tuple[dict[str, Any], set[str]]] = {  # effects of an object, a
         {"cable.segments", "cable.tensions", "cable.guides"},
     ),
     "growth": ({"growth": {"expansion": 1e-3, "amount": 10.0}}, set()),
+    "wind": ({"wind": {"velocity": [3, 0, 0]}}, {"wind.faces"}),
+    "buoyancy": ({"buoyancy": {"level": 0.3}}, {"buoyancy.wetted", "buoyancy.lift"}),
 }  # fmt: skip
 SCHEMES = [("backward_euler", "mixed"), ("ros2", "float64"), ("central_difference", "float32")]
 
@@ -57,7 +60,7 @@ def test_loads_are_built(cupy, tmp_path, scheme, precision):
     loads = {name: params for effects, _ in LOADS.values() for name, params in effects.items()}
     loads |= {"traction": {"where": "X > 0.99", "pressure": 2.0}, "fixed": {"where": "X < 0.01"}}
     given = hollow(tmp_path, loads.pop("cavity"), box(), **loads)
-    sim = Simulation(scene(given, integrator={"scheme": scheme}, precision=precision), "gpu")
+    sim = Simulation(scene(given, integrator={"scheme": scheme}, gravity=G, precision=precision), "gpu")
     sim.engine.run(3)
     assert sim.engine.step == 3
     names = {x.name for x in sim.step_launches}
