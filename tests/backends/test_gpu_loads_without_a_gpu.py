@@ -36,6 +36,7 @@ LOADS: dict[str, tuple[dict[str, Any], set[str]]] = {  # effects of an object, a
     "growth": ({"growth": {"expansion": 1e-3, "amount": 10.0}}, set()),
     "wind": ({"wind": {"velocity": [3, 0, 0]}}, {"wind.faces"}),
     "buoyancy": ({"buoyancy": {"level": 0.3}}, {"buoyancy.wetted", "buoyancy.lift"}),
+    "target": ({"target": {"to": ["X", "Y + 0.2 * X", "Z"], "stiffness": 1e3}}, {"target.tie"}),
 }  # fmt: skip
 SCHEMES = [("backward_euler", "mixed"), ("ros2", "float64"), ("central_difference", "float32")]
 

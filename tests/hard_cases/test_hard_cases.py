@@ -54,6 +54,7 @@ def test_every_effect_with_elements_is_a_model_of_the_hard_cases() -> None:
         "growth",
         "muscle",
         "rayleigh",
+        "target",
         "touch",
         "traction",
         "wind",

@@ -101,6 +101,8 @@ CASES = {
                   "bar.wind.friction": 0.1}),
     "buoyancy": Case({"corotational": YOUNG, "buoyancy": {"level": 0.2}},
                      {"bar.buoyancy.level": 0.4, "bar.buoyancy.density": 900.0}),
+    "target": Case({"corotational": YOUNG, "target": {"to": ["X", "Y + 0.2 * X", "Z"], "stiffness": 1e3}},
+                   {"bar.target.stiffness": 3e3, "bar.target.blend": 0.5}),
     "cable": Case({"corotational": YOUNG, "cable": {"path": PATH, "tension": 40.0}}, {"bar.cable.tension": 90.0}),
     "cable drawn in": Case({"corotational": YOUNG, "cable": {"path": PATH, "stiffness": 1e4, "shortening": 0.0}},
                            {"bar.cable.shortening": 0.02}),

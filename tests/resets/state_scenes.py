@@ -49,6 +49,7 @@ LAWS = {
 MIXED = bar(cells=(2, 2, 2), size=(0.2, 0.2, 0.2), name="cube", density=1000, young=None) | {"effects": LAWS}
 LOADS = {
     "muscle": {"stress": 5e4, "direction": [1, 0, 0]}, "traction": {"where": "X > 0.39", "pressure": 100.0},
+    "target": {"to": ["X", "Y", "1.1 * Z"], "stiffness": 100.0},
     "wind": {"velocity": [3, 0, 5]}, "buoyancy": {"level": 0.05},
     "cable": [
         {"path": [[0, 0, 0], [0.4, 0, 0]], "tension": 5.0}, {"path": [[0, 0.1, 0], [0.4, 0.1, 0]], "stiffness": 1e3},

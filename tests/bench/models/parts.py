@@ -44,6 +44,7 @@ OTHERS = {
     "gravity",
     "muscle",
     "rayleigh",
+    "target",
     "touch",
     "traction",
 }  # effects that are no models
