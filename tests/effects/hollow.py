@@ -37,10 +37,10 @@ def sphere(cells: int, inner: float, outer: float) -> tuple[NDArray, NDArray]:
 
 
 def hollow(folder: Path, cavity: Any, mesh: tuple[NDArray, NDArray] | None = None, **effects: Any) -> dict[str, Any]:
-    """An [[object]] with a cavity; effects: others."""
+    """An [[object]] with the effect cavity, unless it is None, and others."""
     law = {"corotational": {"young": 1e5, "poisson": 0.3}}
     table = {"name": "box", "elements": "linear", "density": 1000, "mesh": mesh_file(folder, *(mesh or box()))}
-    return table | {"effects": law | {"cavity": cavity} | effects}
+    return table | {"effects": law | ({"cavity": cavity} if cavity is not None else {}) | effects}
 
 
 def loaded(given: dict[str, Any], integrator: dict | None = None, dt: float = 0.02, **table: Any) -> Simulation:
