@@ -53,7 +53,9 @@ from sim_server.scene.live import Live
 from sim_server.scene.parameters import NotNegative, Vector, complaint
 
 SCOPE = "object"
-ALONE = {"fibres", "fixed", "rayleigh", "touch", "muscle", "traction"}  # beside these alone it would have no shape
+ALONE = {  # beside these alone it would have no shape
+    "buoyancy", "cable", "cavity", "fibres", "fixed", "growth", "muscle", "rayleigh", "touch", "traction", "wind",
+}  # fmt: skip
 
 
 def _not_zero(direction: tuple[float, float, float]) -> tuple[float, float, float]:
