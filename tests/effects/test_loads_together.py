@@ -6,9 +6,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+from sim_server.recording import messages
 from sim_server.scene.model import Scene
 from sim_server.simulation import Simulation
 from sim_server.updates.driver import Driver
+from sim_server.updates.worker_assembly import Assembly
 from tests.effects.hollow import INSIDE, hollow
 from tests.scenes import scene
 
@@ -80,3 +82,19 @@ def test_a_box_of_gas_falls_on_a_floor(tmp_path):
     found = sim.effects["cavity"].readings()[0]  # type: ignore[attr-defined]
     assert found.pressure > 100 and (found.pressure + 2e4) * found.volume == pytest.approx(2e4 * 0.125, rel=1e-9)
     assert sim.world.x[:, 1].min() > -0.05 and np.abs(sim.world.v).max() < 1
+
+
+def test_a_worker_assembles_the_same_matrix(tmp_path):
+    """Of what follows from positions; it is not asked where drag or a beat is in it, which it cannot know."""
+    loads = {name: table for name, table in LOADS.items() if name != "wind"} | {
+        "cable": [LOADS["cable"], {"path": [[0, 1, 0], [0.5, 1, 1], [1, 0, 1]], "stiffness": 1e4, "shortening": 0.1}],
+        "target": {"to": ["X", "Y", "1.1 * Z"], "stiffness": 1e4}, "growth": {"expansion": 0.02},
+    }  # fmt: skip
+    sim = made(tmp_path, loads)
+    sim.world.x[:] += 0.02 * np.random.default_rng(0).normal(size=sim.world.x.shape)
+    sim.engine.assemble()
+    assert all(e.known_to_workers for e in sim.effects.values())
+    worker = Assembly(messages.scene(sim), messages.topology(sim, sim.world.bodies[0]))
+    assert worker.matrix(sim.world.x.copy()).tobytes() == sim.system.values.tobytes()
+    for unknown in ({"wind": LOADS["wind"]}, {"muscle": LOADS["muscle"] | {"period": 0.3}}):
+        assert not all(e.known_to_workers for e in made(tmp_path, unknown).effects.values())
