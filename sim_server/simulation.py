@@ -22,6 +22,7 @@ from sim_server import backends
 from sim_server.backends.base import Backend, Capability, EngineInput, Launch, PendingUpdate
 from sim_server.backends.compiler import ahead
 from sim_server.backends.kinds import FACTOR_TRUST, WARPED_TRUST, Kind
+from sim_server.backends.rank_one import RankOne
 from sim_server.effects import effect
 from sim_server.effects._base import Effect, Refusal
 from sim_server.errors import DeviceError, InputError
@@ -127,9 +128,14 @@ class Simulation:
         held = w.reaction if w.reaction.size else None
         return EngineInput(
             assemble, integrate, names, ranges, w.dt, self.scene.solver, self.energies, newton, stages, euler, substeps,
-            contact, touch, held, self.scene.accuracy is not None, arrays, history,
+            contact, touch, held, self.scene.accuracy is not None, self._rank_one(), arrays, history,
             self.cutting.cut_input() if self.cutting else None,
         )  # fmt: skip
+
+    def _rank_one(self) -> RankOne | None:
+        """Returns the parts of A beside its blocks; one effect at most has some."""
+        found = [part for e in self.effects.values() if (part := e.rank_one()) is not None]
+        return found[0] if found else None
 
     @classmethod
     def load(cls, path: str | Path, overrides: Sequence[str] = (), device: str = "cpu") -> "Simulation":

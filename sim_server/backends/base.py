@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from sim_server.backends.energies import Energies
     from sim_server.backends.euler_form import EulerForm
     from sim_server.backends.newton import Newton
+    from sim_server.backends.rank_one import RankOne
     from sim_server.backends.rosenbrock import Rosenbrock
     from sim_server.scene.solver_options import SolverOptions
 
@@ -334,6 +335,7 @@ class EngineInput:
     touch: the one of `assemble` that pushes and grabs (effects/touch.cu); None: no object lists the effect
     held: (bodies, k, 6) force [N] and torque [N m] on each holder, attachment and spring; None: there are none
     errors: whether the estimated errors of positions are wanted where they cost time
+    rank_one: parts of A beside its blocks, on a CPU alone; None: there are none
     arrays: of the system by name: row_start, columns, values, b, y, x, v, clock, moving, rotation
     history: launches that begin every step, once, whatever attempts, trials or stages it takes
     cut: of bodies that may lose elements; None: no object lists the effect
@@ -354,9 +356,10 @@ class EngineInput:
     touch: Launch | None
     held: Float64 | None
     errors: bool
+    rank_one: RankOne | None
     arrays: Mapping[str, NDArray[Any]]
     history: Sequence[Launch] = ()
-    cut: "CutInput | None" = None
+    cut: CutInput | None = None
 
 
 @dataclass(frozen=True)

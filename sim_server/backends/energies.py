@@ -44,7 +44,7 @@ class Energies:
     before: (n, 3) gets x when a step begins [m]
     still: arrays (n, 3) that are 0 in a body at rest
     gravity: (3,) [m/s2]
-    touch: arrays force, spring and anchor of the effect touch, and load of the effect traction, by name
+    touch: arrays force, spring and anchor of the effect touch, and load of the effects with loads, by name
     elastic: energies of the elements of each effect that has any
     balance: (bodies,) of structs.BALANCE; on a CPU what the loop works with
     inertia: False in a quasi-static scene

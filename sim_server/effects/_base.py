@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from sim_server.arrays import Float64, Int32
 from sim_server.backends.base import Launch, PendingUpdate
 from sim_server.backends.energies import ElementEnergies
+from sim_server.backends.rank_one import RankOne
 from sim_server.mechanics.system import Coupled, Stencil, System
 from sim_server.mechanics.world import Body, World
 from sim_server.scene import Scene
@@ -139,9 +140,13 @@ class Effect:
         """Returns arrays that the energy balance of a step reads, by their names in backends.energies; {} for most.
 
         gravity: acceleration (3,) [m/s2]. force (n, 3) [N], spring (n,) [N/m], anchor (n, 3) [m]: of pushes and grabs.
-        load (n, 3): of surfaces [N].
+        load (n, 3): of all loads [N] (_loads.py).
         """
         return {}
+
+    def rank_one(self) -> RankOne | None:
+        """Returns what it adds to A beside blocks, on a CPU alone; None for most."""
+        return None
 
     def energies(self) -> ElementEnergies | None:
         """Potential energies of its elements; None for an effect without."""

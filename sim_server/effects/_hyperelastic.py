@@ -56,11 +56,10 @@ from sim_server.arrays import Float64, Int32
 from sim_server.backends.base import Launch
 from sim_server.backends.energies import ElementEnergies
 from sim_server.effects._base import Effect, PerBody, Refusal
+from sim_server.effects._rest_shape import RestShape
 from sim_server.errors import InputError
-from sim_server.mechanics.removal import present
 from sim_server.mechanics.system import Stencil, System
 from sim_server.mechanics.world import Body, World
-from sim_server.mesh.shape_functions import shape_gradients
 from sim_server.scene import Scene
 from sim_server.scene.live import POISSON, STIFFNESS, Live
 from sim_server.scene.parameters import Parameters, Positive
@@ -167,12 +166,15 @@ class Tetrahedra(Effect):
         counts = [len(body.mesh.tets) for body, _ in listed]
         self.owner = np.repeat([body.index for body, _ in listed], counts)[self.order]
         self.number = np.concatenate([np.arange(n) for n in counts])[self.order]
-        volume, gradients = shape_gradients(world.rest, self.elements)
-        self.volume = world.follow("cutting", compute=lambda scene: volume * present(scene, self.bodies)[self.order])
-        rows = gradients.reshape(-1, 9).T
-        self.gradients = world.follow("cutting", compute=lambda scene: rows * present(scene, self.bodies)[self.order])
+        self.rest = RestShape(world, self.bodies, self.elements, self.order)
+        self.volume = self.rest.followed(world, lambda scene: self.rest.volume(scene) * self.rest.present(scene))
+        self.gradients = self.rest.followed(world, self._gradients)
         self.corners, self.edges = np.zeros((4, m, 9)), np.zeros((6, m, 9))
         self._energy = np.zeros(m)
+
+    def _gradients(self, scene: Scene) -> Float64:
+        """Returns gradients (9, m); 0 for elements that were removed, which so have one deformation, wherever they are."""
+        return self.rest.gradients(scene).reshape(-1, 9).T * self.rest.present(scene)
 
     def values_in(self, scene: Scene, law: Law) -> list[Values]:
         """Returns the constants of each body's elements by the parameters of a scene. Raises InputError."""
@@ -219,24 +221,25 @@ class Hyperelastic(Tetrahedra):
         self.constants = self.packed(law)
         self.elastic = world.at_start(self.elastic_in)
         if law.axes is not None:
-            self.gradients = world.follow(law.name, compute=partial(self._gradients_along, law.axes, self.gradients))
+            along = partial(self._gradients_along, law.axes)
+            self.gradients = world.follow(law.name, *self.rest.of, compute=along)
         floors = [getattr(p, "floor", 0.0) if getattr(p, "inversion", "") == "regularize" else 0.0 for _, p in listed]
         floor = np.repeat(floors, [len(body.mesh.tets) for body, _ in listed])[self.order]
 
         def defined(scene: Scene) -> Float64:
-            return np.where(present(scene, self.bodies)[self.order] > 0, floor, REMOVED_FLOOR)
+            return np.where(self.rest.present(scene) > 0, floor, REMOVED_FLOOR)
 
-        self.floor = world.follow("cutting", compute=defined)
+        self.floor = self.rest.followed(world, defined)
         self.refused = np.tile([-1.0, 0.0], (len(self.elements), 1))
 
     def cuttable(self, body: Body) -> bool:
         """Returns whether the law is defined for elements that are inside out, as removed ones may be."""
         return self.law.regularizes or not self.law.refuses
 
-    def _gradients_along(self, axes_of: Callable[[Values], Float64], gradients: Float64, scene: Scene) -> Float64:
+    def _gradients_along(self, axes_of: Callable[[Values], Float64], scene: Scene) -> Float64:
         """Returns gradients (9, m) by the material axes."""
         axes = np.concatenate([axes_of(values) for values in self.values_in(scene, self.law)])[self.order]
-        rows = gradients.T.reshape(-1, 3, 3) @ axes
+        rows = self.rest.gradients(scene) @ axes
         return np.asarray(rows.reshape(-1, 9).T)
 
     def elastic_in(self, scene: Scene) -> Mapping[int, tuple[Float64, Float64]]:

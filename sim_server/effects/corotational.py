@@ -54,11 +54,10 @@ from sim_server.arrays import Float64, Int32
 from sim_server.backends.base import Launch
 from sim_server.backends.energies import ElementEnergies
 from sim_server.effects._base import Effect, PerBody
+from sim_server.effects._rest_shape import RestShape
 from sim_server.errors import InputError
-from sim_server.mechanics.removal import present
 from sim_server.mechanics.system import Stencil, System
 from sim_server.mechanics.world import Body, World
-from sim_server.mesh.shape_functions import shape_gradients
 from sim_server.scene import Scene
 from sim_server.scene.integrator_options import IntegratorOptions
 from sim_server.scene.live import POISSON, STIFFNESS
@@ -128,17 +127,17 @@ class Corotational(Effect):
         self.elements: Int32 = np.ascontiguousarray(tets[order])
         self._constants = PerBody("corotational", self.rotated, _constants)
         self.elastic = world.at_start(self.elastic_in)
-        volume, gradients = shape_gradients(world.rest, self.elements)
-        self.gradients = np.ascontiguousarray(gradients.reshape(-1, 9).T)
+        rest = RestShape(world, self.rotated, self.elements, order)
+        self.gradients = rest.followed(world, lambda scene: rest.gradients(scene).reshape(-1, 9).T)
 
         def lame(scene: Scene) -> Float64:
             young, poisson = np.concatenate([*self.elastic_in(scene).values()], axis=1)[:, order]
             lam = young * poisson / ((1 + poisson) * (1 - 2 * poisson))
             mu = young / (2 * (1 + poisson))
-            here = present(scene, self.rotated)[order]
-            return np.stack([lam * volume * here, mu * volume * np.where(here > 0, 1, REMOVED)])
+            volume, here = rest.volume(scene), rest.present(scene)
+            return np.stack([lam * volume * here, mu * volume * np.where(here > 0, 1.0, REMOVED)])
 
-        self.lame = world.follow("corotational", "cutting", compute=lame)
+        self.lame = world.follow("corotational", *rest.of, compute=lame)
         owner = np.repeat([body.index for body, _ in listed], [len(body.mesh.tets) for body, _ in listed])
         self.owner = owner[order]
         m = len(self.elements)

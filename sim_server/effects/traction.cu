@@ -23,6 +23,7 @@ struct Load {
     const real* area;     // (triangles, 3) [m2]
     const real* dead;     // (n, 3) forces that do not follow the surface [N]
     real h;               // world.force_coefficient [s]
+    int accumulate;       // 0: write load, 1: add to what another effect wrote
     own<real> b;          // (n, 3) in, out: += h f [N s]
     real* load;           // (n, 3) out: f, for the energy balance [N]
 };
@@ -37,7 +38,7 @@ INLINE void load_add(const Load& p, int, int k, local* sum) {
 INLINE void load_put(const Load& p, int i, const local* sum) {
     const vec3 f = load3(p.dead, i) + vec3{sum[0], sum[1], sum[2]};
     store3(p.b, i, load3(p.b, i) + p.h * f);
-    store3(p.load, i, f);
+    store3(p.load, i, p.accumulate ? load3(p.load, i) + f : f);
 }
 
 SUM_KERNEL(load, Load, 3)

@@ -42,7 +42,8 @@ from pydantic import BeforeValidator, Field, model_validator
 
 from sim_server.arrays import Float64, Int32
 from sim_server.backends.base import Launch
-from sim_server.effects._base import Effect, params_in
+from sim_server.effects._base import params_in
+from sim_server.effects._loads import LoadingEffect
 from sim_server.errors import InputError
 from sim_server.mechanics.system import Stencil, System
 from sim_server.mechanics.world import Body, World
@@ -164,15 +165,15 @@ class Part:
         return np.asarray(np.linalg.pinv(second, rcond=1e-9) @ np.cross(moment, normal))
 
 
-class Traction(Effect):
+class Traction(LoadingEffect):
     """All loads on surfaces of a scene.
 
-    surface (t, 3): corners of the triangles whose loads follow them; load (n, 3): forces on nodes in the last
-    evaluation [N]
+    surface (t, 3): corners of the triangles whose loads follow them
     """
 
     def __init__(self, world: World, listed: list[tuple[Body, Any]]):
-        self.world, self._bodies = world, [body for body, _ in listed]
+        super().__init__(world)
+        self._bodies = [body for body, _ in listed]
         self._parts = [[Part(world, body, load) for load in params.loads] for body, params in listed]
         self.dead = world.follow("traction", compute=self._dead)
         corners = [p.corners for p, load in self._each(params for _, params in listed) if p.follows(load)]
@@ -183,8 +184,8 @@ class Traction(Effect):
         counts = np.bincount(self.surface.ravel(), minlength=world.nodes)
         self.start = np.concatenate([[0], np.cumsum(counts)]).astype(np.int32)
         self.share = world.follow("traction", compute=self._shares)
-        self.area, self.load = np.zeros((len(self.surface), 3)), np.zeros((world.nodes, 3))
-        world.backend.keep(self.surface, self.triangle, self.start, self.area, self.load)
+        self.area = np.zeros((len(self.surface), 3))
+        world.backend.keep(self.surface, self.triangle, self.start, self.area)
 
     def _each(self, listed: Any) -> list[tuple[Part, Load | Params]]:
         """Returns each part with its load. listed: parameters of the bodies."""
@@ -208,14 +209,11 @@ class Traction(Effect):
         w, text = self.world, self.world.backend.module("effects/traction.cu")
         load = text.bind(
             "load", w.nodes, start=self.start, triangle=self.triangle, share=self.share, area=self.area,
-            dead=self.dead, h=w.force_coefficient, b=system.b, load=self.load,
+            dead=self.dead, h=w.force_coefficient, accumulate=self.adds_to_load, b=system.b, load=self.load,
         )  # fmt: skip
         if not len(self.surface):
             return [load]
         return [text.bind("areas", len(self.surface), corner=self.surface, x=w.x, area=self.area), load]
-
-    def balance_arrays(self) -> dict[str, Float64]:
-        return {"load": self.load}
 
 
 def build(world: World, listed: list[tuple[Body, Any]]) -> Traction:

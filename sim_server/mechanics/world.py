@@ -4,7 +4,7 @@
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -74,6 +74,14 @@ class LiveArray:
     compute: Callable[[Scene], NDArray[Any]]
 
 
+class AddsLoad(Protocol):
+    """An effect that adds to the loads, as far as its place among the launches goes."""
+
+    @property
+    def elements(self) -> Int32 | None:
+        """Elements that couple nodes; launches of effects with some come first."""
+
+
 class World:
     """State and node data of a scene.
 
@@ -90,6 +98,8 @@ class World:
     obstacles, holders, attachments, springs: of the scene; reaction (bodies, k, 6): force [N] and torque [N m] of each
     body on each of the k holders, attachments and springs in the last step; gravity_of: acceleration by the parameters
     of a scene, 0 without the effect [m/s2];
+    load (n, 3): forces of loads in the last evaluation [N], empty without any; loading: the effects that add to it, in
+    the order in which they were built;
     backend: where kernels run.
 
     Effects use the following of the integrator in place of dt and v (formulas: integrator.py; symbols:
@@ -142,6 +152,7 @@ class World:
         self.held_nodes, self.held_moves = np.zeros(0, np.int32), np.zeros(len(self.bodies), np.int32)
         self.touchable: Float64 | None = None
         self.rollers: Rollers | None = None
+        self.load, self.loading = np.zeros((0, 3)), list[AddsLoad]()
         self.alpha, self.beta = np.zeros(len(self.bodies)), np.zeros(len(self.bodies))
         self.damping: Callable[[Scene], tuple[Float64, Float64]] = lambda _: (self.alpha, self.beta)
         integrator = scene.integrator
@@ -174,6 +185,14 @@ class World:
         """Has an array that there is follow parameters, as `follow` does for a new one."""
         array[...] = compute(self._scene)
         self.live_arrays.append(LiveArray(array, of, compute))
+
+    def share_load(self, effect: AddsLoad) -> Float64:
+        """Returns `load` for an effect to add to."""
+        if not self.loading:
+            self.load = np.zeros((self.nodes, 3))
+            self.backend.keep(self.load)
+        self.loading.append(effect)
+        return self.load
 
     @contextmanager
     def made_with(self, force_coefficient: float, dx_dv: float, usual_tangent: bool) -> Iterator[None]:

@@ -74,6 +74,8 @@ def _reason(elements: Elements, effects: Mapping[str, Any], integrator: Integrat
         return f'without the effect corotational{others}, which alone have such elements; allowed: "auto", "linear"'
     if "corotational" in effects and effects["corotational"].rotation == "qr":
         return 'with corotational.rotation = "qr", which is that of tetrahedra; allowed: "auto", "linear"'
+    if "growth" in effects:
+        return 'with the effect growth, which linear elements alone have; allowed: "auto", "linear"'
     if integrator.explicit:
         given = f'integrator.scheme = "{integrator.scheme}"'
         return f'with {given}, which has linear elements alone; allowed: "auto", "linear"'

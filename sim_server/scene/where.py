@@ -60,7 +60,18 @@ def mask(expression: str, points: Float64) -> NDArray[np.bool_]:
         raise InputError(f"where = {shortened(expression)}: {error}") from None
 
 
-def parse(expression: str) -> ast.expr:
+def values(expression: str, points: Float64) -> Float64:
+    """Evaluates an `expression` for a number, such as ``X * (1 + Y)``, at `points` (n, 3) [m]; returns (n,).
+
+    Raises InputError as `mask` does.
+    """
+    try:
+        return _number(parse(expression, "number"), np.asarray(points, dtype=np.float64))
+    except InputError as error:
+        raise InputError(f"{shortened(expression)}: {error}") from None
+
+
+def parse(expression: str, kind: Kind = "truth") -> ast.expr:
     """Returns the checked syntax tree of `expression`; raises InputError that says what is wrong and allowed."""
     if len(expression) > MAX_LENGTH:
         raise InputError(f"longer than {MAX_LENGTH} characters; {ALLOWED}")
@@ -71,7 +82,7 @@ def parse(expression: str) -> ast.expr:
     if _depth(tree) > MAX_DEPTH:
         raise InputError(f"nested more than {MAX_DEPTH} levels deep; {ALLOWED}")
     try:
-        _expect(tree, "truth")
+        _expect(tree, kind)
     except InputError as error:
         raise InputError(f"{error}; {ALLOWED}") from None
     return tree

@@ -44,8 +44,22 @@ def test_every_model_and_every_situation_is_among_those_tested() -> None:
 
 
 def test_every_effect_with_elements_is_a_model_of_the_hard_cases() -> None:
-    others = {"contact", "fixed", "gravity", "rayleigh", "touch", "traction"}
-    others |= {"damage", "plasticity", "prony"}  # beside laws that are: tests/effects/test_history.py
+    others = {
+        "buoyancy",
+        "cable",
+        "cavity",
+        "contact",
+        "fixed",
+        "gravity",
+        "growth",
+        "muscle",
+        "rayleigh",
+        "target",
+        "touch",
+        "traction",
+        "wind",
+    }
+    others |= {"cutting", "damage", "plasticity", "prony"}  # beside laws that are: tests/effects/test_history.py
     assert {model.effect for model in MODELS.values()} == set(known_effects()) - others
 
 

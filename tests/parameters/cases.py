@@ -2,6 +2,9 @@
 """Scenes with every live parameter, and other values of it."""
 
 from collections.abc import Mapping
+from functools import cache
+from pathlib import Path
+from tempfile import mkdtemp
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
@@ -10,6 +13,8 @@ import numpy as np
 from sim_server.parameters import toml
 from sim_server.scene.model import Scene
 from sim_server.simulation import Simulation
+from tests.effects.hollow import INSIDE, box
+from tests.scenes import mesh_file
 from tests.state import put
 
 FIXED = {"fixed": {"where": "X < 0.01"}}
@@ -18,6 +23,13 @@ REGIONS = [{"where": "X < 0.7", "young": 2e5}, {"young": 5e4, "poisson": 0.2}]
 YOUNG = {"young": 1e5, "poisson": 0.3}
 STRETCHED = {"direction": [[1, 0, 0], [0, 1, 0]]}
 LOADS = {"where": "X > 1.49", "force": [0, 30, 0], "stress": [5, 0, 0], "pressure": 40.0, "moment": [0, 9, 3]}
+
+
+BEATS = {"stress": 3e4, "direction": [1, 1, 0], "activation": 0.7, "period": 0.1, "phase": 0.2, "duty": 0.8,
+         "optimum": 1.1, "width": 0.6}  # fmt: skip
+
+
+PATH = [[0.0, 0.0, 0.0], [0.5, 0.5, 0.0], [1.0, 0.5, 0.5], [1.5, 0.0, 0.5]]
 
 
 class Case(NamedTuple):
@@ -81,6 +93,34 @@ CASES = {
     "traction": Case({"corotational": YOUNG, "traction": LOADS},
                      {"bar.traction.force": [9, 3, 0], "bar.traction.stress": [0, 90, 0],
                       "bar.traction.pressure": -60.0, "bar.traction.moment": [0, 4, -5]}),
+    "muscle": Case({"corotational": YOUNG, "muscle": {"stress": 2e4, "direction": [1, 0, 0]}},
+                   {f"bar.muscle.{key}": value for key, value in BEATS.items()}, start=True),
+    "cavity": Case({"corotational": YOUNG, "cavity": {"where": INSIDE, "pressure": 90.0}},
+                   {"bar.cavity.pressure": 200.0}),
+    "gas": Case({"corotational": YOUNG, "cavity": {"where": INSIDE, "amount": 1.0, "ambient": 1e3}},
+                {"bar.cavity.amount": 1.5}),
+    "liquid": Case({"corotational": YOUNG, "cavity": {"where": INSIDE, "volume": 0.125, "bulk": 1e4}},
+                   {"bar.cavity.volume": 0.13}),
+    "cavities": Case({"corotational": YOUNG, "cavity": [{"where": INSIDE, "pressure": 90.0}]},
+                     {"bar.cavity.tables": [{"where": INSIDE, "pressure": -30.0}]}),
+    "growth": Case({"corotational": YOUNG, "growth": {"expansion": 0.1}},
+                   {"bar.growth.expansion": [0.2, 0.1, 0], "bar.growth.amount": 0.5}),
+    "growth of a law": Case(
+        {"neo_hookean": YOUNG, "fibres": {"stiffness": 2e4} | STRETCHED, "growth": {"expansion": 0.1}},
+        {"bar.growth.amount": 2.0},
+    ),
+    "wind": Case({"corotational": YOUNG, "wind": {"velocity": [3, 0, 0]}},
+                 {"bar.wind.velocity": [0, 5, 1], "bar.wind.density": 900.0, "bar.wind.drag": 0.7,
+                  "bar.wind.friction": 0.1}),
+    "buoyancy": Case({"corotational": YOUNG, "buoyancy": {"level": 0.2}},
+                     {"bar.buoyancy.level": 0.4, "bar.buoyancy.density": 900.0}),
+    "target": Case({"corotational": YOUNG, "target": {"to": ["X", "Y + 0.2 * X", "Z"], "stiffness": 1e3}},
+                   {"bar.target.stiffness": 3e3, "bar.target.blend": 0.5}),
+    "cable": Case({"corotational": YOUNG, "cable": {"path": PATH, "tension": 40.0}}, {"bar.cable.tension": 90.0}),
+    "cable drawn in": Case({"corotational": YOUNG, "cable": {"path": PATH, "stiffness": 1e4, "shortening": 0.0}},
+                           {"bar.cable.shortening": 0.02}),
+    "cables": Case({"corotational": YOUNG, "cable": [{"path": PATH, "tension": 40.0}]},
+                   {"bar.cable.tables": [{"path": PATH, "tension": 9.0}]}),
     "gravity": law("corotational", YOUNG)._replace(values={"gravity.g": [4.0, 1.0, 0.0]}),
     "friction": Case({"corotational": YOUNG}, {"bar.friction": 0.2, "floor.friction": 0.1, "wall.friction": 0.3,
                      "contact.friction": [PAIR | {"value": 0.9}], "gravity.g": [1, -9, 0]}, CONTACT, True),
@@ -109,14 +149,21 @@ CASES["contact"] = CASES["friction"]._replace(
 )
 
 
+@cache
+def hollow_mesh() -> dict[str, str]:
+    """The `mesh` table of a box with a cavity."""
+    return mesh_file(Path(mkdtemp()), *box())
+
+
 def table(case: Case) -> dict[str, Any]:
     """The scene of a case."""
     effects = case.effects if "obstacle" in case.scene else case.effects | FIXED
+    mesh = hollow_mesh() if "cavity" in effects else BAR
     explicit = case.scene.get("integrator", {}).get("scheme") == "central_difference"
     return {
         "name": "case", "dt": 0.01, "effects": {"gravity": {"g": [0, -9.81, 0]}},
         "solver": {"preconditioner": "none" if explicit else "block_jacobi", "warm_start": False},
-        "object": [{"name": "bar", "mesh": BAR, "effects": effects}], **case.scene,
+        "object": [{"name": "bar", "mesh": mesh, "effects": effects}], **case.scene,
     }  # fmt: skip
 
 

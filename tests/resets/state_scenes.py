@@ -57,6 +57,14 @@ VISCOUS = {"prony": {"terms": [{"g": 0.8, "tau": 0.05}, {"g": 0.3, "tau": 1.0}],
 FLOWING = {"plasticity": {"yield_stress": 300.0, "hardening": 1e3}}
 TEARING = {"damage": {"strength": 500.0, "fracture_energy": 1.0}}
 MIXED = bar(cells=(2, 2, 2), size=(0.2, 0.2, 0.2), name="cube", density=1000, young=None) | {"effects": LAWS}
+LOADS = {
+    "muscle": {"stress": 5e4, "direction": [1, 0, 0]}, "traction": {"where": "X > 0.39", "pressure": 100.0},
+    "target": {"to": ["X", "Y", "1.1 * Z"], "stiffness": 100.0},
+    "wind": {"velocity": [3, 0, 5]}, "buoyancy": {"level": 0.05},
+    "cable": [
+        {"path": [[0, 0, 0], [0.4, 0, 0]], "tension": 5.0}, {"path": [[0, 0.1, 0], [0.4, 0.1, 0]], "stiffness": 1e3},
+    ],
+}  # fmt: skip
 SCENES: dict[str, dict[str, Any]] = {
     "laws": table([beam(tangent="exact"), MIXED]),
     "newton": table([beam()], integrator=NEWTON),
@@ -82,6 +90,7 @@ SCENES: dict[str, dict[str, Any]] = {
     "damage": table(
         [remembering(beam(), TEARING), beam(name="other", pose={"translate": [0, 0, 1]})], integrator=NEWTON
     ),
+    "loaded": table([beam() | {"effects": beam()["effects"] | LOADS}]),
     "held": table(
         [beam()], holder=[{"name": "hand", "object": "beam", "where": "X > 0.39", "moved": "client", "max_speed": 0.5}]
     ),

@@ -27,6 +27,7 @@ from sim_server.backends.cpu.device import CpuLaunch
 from sim_server.backends.cpu.energies import NativeEnergies
 from sim_server.backends.euler_form import EulerForm
 from sim_server.backends.newton import Newton
+from sim_server.backends.rank_one import RankOne
 from sim_server.backends.ring_buffers import Reports
 from sim_server.backends.rosenbrock import NODAL, Rosenbrock
 from sim_server.backends.state import StateArray, host_array, memory_of, numbers_array, same_body
@@ -104,6 +105,15 @@ class Mailbox:
     buffers: list[NativeFactor]
     waiting: NativeFactor | None = None  # as posted last
     in_use: NativeFactor | None = None  # as far as the mailbox has told
+
+
+class _NativeRankOne:
+    """Parts of A of rank one, attached to a loop."""
+
+    def __init__(self, given: RankOne, rotation: Reals, loop: structs.Loop):
+        self._arrays = {**vars(given), "rotation": rotation}
+        self.native = structs.RankOne(**{name: array.ctypes.data for name, array in self._arrays.items()})
+        loop.rank_one = c.addressof(self.native)
 
 
 class _NativeNewton:
@@ -461,6 +471,7 @@ class CpuEngine(Reports):
         for name in ("row_start", "columns", "values", "b", "y", "x", "v", "clock", "moving"):
             setattr(loop, name, arrays[name].ctypes.data)
         loop.work, loop.threads = self._work.ctypes.data, given.solver.threads
+        self._rank_one = given.rank_one and _NativeRankOne(given.rank_one, arrays["rotation"], loop)
         self._newton = None
         if given.newton:
             late = [x.domain == "blocks" and given.held is None for x in given.assemble]  # holders take forces from A

@@ -188,6 +188,11 @@ class Energies(c.Structure):
 
 
 @LOOP.struct
+class RankOne(c.Structure):
+    """Parts of A of rank one beside its blocks."""
+
+
+@LOOP.struct
 class Loop(c.Structure):
     """All that the loop works with."""
 

@@ -21,7 +21,7 @@ struct EnergyBalance {
     real* force;                // (n, 3) of touches (effects/touch.cu); null: nothing can be touched
     real* spring;               // (n,)
     real* anchor;               // (n, 3)
-    const real* load;           // (n, 3) of surfaces (effects/traction.cu), or null
+    const real* load;           // (n, 3) of the effects with loads (effects/_loads.py), or null
     real* free;                 // (n,) set to 0 where a body is frozen
     const real* gravity;        // (3,) [m/s2]
     Balance* balance;           // (bodies,)
@@ -54,7 +54,7 @@ __device__ __forceinline__ Sums sums_over(const EnergyBalance& a, int begin, int
     return s;
 }
 
-// Work of loads on surfaces.
+// Work of loads.
 __device__ __forceinline__ double load_work_over(const EnergyBalance& a, int begin, int end) {
     double work = 0;
     for (long long i = begin + threadIdx.x; a.load && i < end; i += blockDim.x)

@@ -37,7 +37,17 @@ BESIDE = {
     "fibres": {"neo_hookean": {"young": 1e6, "poisson": 0.45}}
 }  # what an effect is listed beside, and measured with
 PARTS = ("elements", "sums", "rest")
-OTHERS = {"contact", "fixed", "gravity", "rayleigh", "touch", "traction"}  # effects that are no models
+OTHERS = {
+    "cavity",
+    "contact",
+    "fixed",
+    "gravity",
+    "muscle",
+    "rayleigh",
+    "target",
+    "touch",
+    "traction",
+}  # effects that are no models
 STRETCH, CURVATURE, NOISE = 1.05, 0.15, 0.01  # -, 1/m, of an edge
 
 Reals = NDArray[np.float64]

@@ -6,6 +6,7 @@
 
 #include "contact_rows.h"
 #include "invert3.cuh"
+#include "rank_one.h"
 
 struct BlockCsr {
     int32_t first, last;        // nodes [first, last) of a body; vectors below start at its first node
@@ -13,6 +14,8 @@ struct BlockCsr {
     const int32_t* columns;     // node numbers in the scene
     const double* values;       // (blocks, 3, 3)
     const Rows* rows = nullptr;  // of contacts that A has beside its values, or null
+    const RankOne* rank_one = nullptr;  // parts of rank one that it has, too, or null
+    int body = 0;               // whose they are
     int size() const { return 3 * (last - first); }
 };
 
@@ -33,6 +36,7 @@ static double multiply(const BlockCsr& A, const double* x, double* y) {
         w[0] = y0; w[1] = y1; w[2] = y2;
         sum += u[0] * y0 + u[1] * y1 + u[2] * y2;
     }
+    if (A.rank_one) sum += add_product(*A.rank_one, A.body, A.first, x, y);
     return A.rows ? sum + A.rows->add_product(x, y) : sum;
 }
 

@@ -289,7 +289,7 @@ static void finish_step(Loop* loop) {
         } else if (loop->contact) {
             r = loop->contact->result[i];
         } else {
-            BlockCsr A{body.first, body.last, loop->row_start, loop->columns, loop->values};
+            const BlockCsr A = matrix_of(*loop, body);
             r = pcg(A, loop->b + 3 * body.first, body.factor, settings, loop->y + 3 * body.first,
                     loop->work + WORK * (int64_t)body.first, !loop->moving[i], &body.correction);
         }
@@ -402,7 +402,7 @@ void wf_apply_factor(const Factor* factor, const double* r, double* z, double* w
 void wf_precondition(Loop* loop, int32_t index, const double* r, double* z, double* work) {
     Body& body = loop->body[index];
     take_factor(body);
-    BlockCsr A{body.first, body.last, loop->row_start, loop->columns, loop->values};
+    const BlockCsr A = matrix_of(*loop, body);
     Preconditioner P{A, body.factor, CHOLESKY, nullptr, work, 1, &body.correction};
     P.prepare();
     P.apply(r, std::sqrt(dot(A.size(), r, r)), z);

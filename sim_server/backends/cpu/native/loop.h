@@ -147,7 +147,7 @@ struct Energies {                      // energy.h
     const double* mass;                // (nodes,) [kg]
     const double* before;              // (nodes, 3) x when the step began [m]
     double *force, *spring, *anchor;   // of hands (effects/touch.cu); null: nothing can be touched
-    const double* load;                // (nodes, 3) of surfaces (effects/traction.cu), or null
+    const double* load;                // (nodes, 3) of the effects with loads (effects/_loads.py), or null
     double* free;                      // (nodes,) 0 from when a body is frozen
     double** still;                    // arrays (nodes, 3) that are 0 then
     Elastic* elastic;
@@ -170,6 +170,7 @@ struct Loop {
     const int32_t* row_start;
     const int32_t* columns;
     const double* values;
+    const RankOne* rank_one;           // parts of A beside its blocks, or null
     const double* b;                   // (nodes, 3) right-hand side in the material frame
     double* y;                         // (nodes, 3) start in, solution out
     double* x;                         // (nodes, 3) for frames
@@ -194,5 +195,5 @@ struct Loop {
 };
 
 static BlockCsr matrix_of(const Loop& loop, const Body& body) {
-    return {body.first, body.last, loop.row_start, loop.columns, loop.values};
+    return {body.first, body.last, loop.row_start, loop.columns, loop.values, nullptr, loop.rank_one, (int)(&body - loop.body)};
 }

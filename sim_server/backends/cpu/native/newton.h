@@ -91,7 +91,7 @@ static void solve(Loop& loop, int index) {
     BodyRoom room(newton, body);
     const int64_t at = 3 * (int64_t)body.first;
     double *y = loop.y + at, *work = loop.work + WORK * (int64_t)body.first, *material = work, *product = work + room.n;
-    BlockCsr A{body.first, body.last, loop.row_start, loop.columns, loop.values};
+    const BlockCsr A = matrix_of(loop, body);
     SolveSettings settings = body.now;
     settings.warm_start = settings.warm_start && search.linearizations == 0;  // the last step's is no guess for a correction
     settings.tolerance = solve_tolerance(search, settings.tolerance, body.factor ? settings.kind : BLOCK_JACOBI);

@@ -115,7 +115,8 @@ struct Passes : IslandRows {
         const int64_t at = 3 * (int64_t)body.first;
         Rows own = rows;
         own.node_first = body.first;
-        const BlockCsr A{body.first, body.last, loop.row_start, loop.columns, loop.values, &own};
+        BlockCsr A = matrix_of(loop, body);
+        A.rows = &own;
         double* work = loop.work + WORK * (int64_t)body.first;
         tell_correction(rows, body);
         auto solve_by = [&] { return pcg(A, r + at, body.factor, settings, dy + at, work, false, &body.correction); };
