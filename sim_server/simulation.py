@@ -11,7 +11,7 @@ push    service/commands.py carries it out on effects/touch.py, which calls `upd
 record  service/telemetry.py fetches those of the engine (`records`) for recording/recorder.py and network/publishers.py
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
@@ -57,7 +57,7 @@ class Simulation:
     def __init__(self, scene: Scene, device: str = "cpu", watched: bool = True):
         self.scene = scene
         scene.check_device(device)
-        backend = backends.create(device, scene.solver.precision)
+        backend = self.make_backend(device)
         if scene.solver.wants_factors:
             ahead("backends/cpu/native/factor_check.cpp")
         self.on_effect_update: list[Callable[[Effect, PendingUpdate], None]] = []
@@ -68,10 +68,18 @@ class Simulation:
             self._build(backend, watched)
         self.parameters = LiveParameters(self)
 
+    def make_backend(self, device: str) -> Backend:
+        """Returns the place where the kernels of this scene run."""
+        return backends.create(device, self.scene.solver.precision)
+
+    def make_effects(self) -> dict[str, Effect]:
+        """Returns the effects that the scene lists, and no others, by name (and variant)."""
+        return dict(each_effect(self.scene, self.world))
+
     def _build(self, backend: Backend, watched: bool) -> None:
         scene, solver = self.scene, self.scene.solver
         self.world = World(scene, backend)
-        self.effects = build_effects(scene, self.world)
+        self.effects = self.make_effects()
         self.ties = self.contact.contact_input().ties if self.contact else make_ties(self.world)
         if self.holders and self.touch:
             self.holders.use_load(self.touch.force)
@@ -332,21 +340,23 @@ class Simulation:
         return bsr_array((self.system.body_values(b.first, b.last).copy(), columns, row_start), shape=(n, n)).tocsc()
 
 
-def build_effects(scene: Scene, world: World) -> dict[str, Effect]:
-    """The effects that the scene lists, and no others, by name (and variant)."""
-    built: dict[str, Effect] = {}
+def each_effect(scene: Scene, world: World) -> Iterator[tuple[str, Effect]]:
+    """Builds the effects that the scene lists, and no others, one by one; yields each with its name (and variant)."""
     if world.holders:
         from sim_server.effects._holders import Holders
 
-        built["holders"] = Holders(world)
+        yield "holders", Holders(world)
     for name in sorted({n for o in scene.objects for n in o.effects}):
         variants: dict[str, list[tuple[Body, Any]]] = {}
         for body, params in world.with_effect(name):
             variants.setdefault(params.variant_of(body.elements), []).append((body, params))
         for variant, listed in variants.items():
-            built[name + variant] = effect(name).build(world, listed)
-            built[name + variant].name = name
+            yield name + variant, _built(name, world, listed)
     for name, params in sorted(scene.effects.items(), key=lambda item: item[0] != "gravity"):  # contact asks for it
-        built[name] = effect(name).build(world, [(body, params) for body in world.bodies])
-        built[name].name = name
-    return built
+        yield name, _built(name, world, [(body, params) for body in world.bodies])
+
+
+def _built(name: str, world: World, listed: list[tuple[Body, Any]]) -> Effect:
+    made: Effect = effect(name).build(world, listed)
+    made.name = name
+    return made

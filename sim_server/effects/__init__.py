@@ -31,3 +31,9 @@ def effect(name: str) -> ModuleType:
     if name not in known_effects():
         raise InputError(f"no effect {name!r} (known effects: {', '.join(known_effects())})")
     return importlib.import_module(f"{__name__}.{name}")
+
+
+def effect_of(module: str) -> str:
+    """The effect that a module of this name is; empty for a module that is none."""
+    folder, _, name = module.rpartition(".")
+    return name if folder == __name__ and not name.startswith("_") else ""

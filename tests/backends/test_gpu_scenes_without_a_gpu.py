@@ -14,6 +14,7 @@ from sim_server.backends.gpu.inverse.plan import plan
 from sim_server.backends.gpu.inverse.workspace import workspace
 from sim_server.backends.gpu.islands import OWN_SURFACES
 from sim_server.checkpoint.content import capture
+from sim_server.explain.explanation import explain
 from sim_server.simulation import Simulation
 from sim_server.state.arrays import state_arrays
 from sim_server.state.start import Start
@@ -350,3 +351,14 @@ def test_a_scene_with_holders_is_built(cupy, precision):
     engine.run(3)
     records, reactions = engine.records_and_reactions()
     assert records["step"].tolist() == [1, 2, 3] and reactions.shape == (3, 2, 6)
+
+
+def test_a_scene_on_a_gpu_is_explained(cupy):
+    """Each effect has the twins of its arrays: gravity the three numbers of g, in the precision of the kernels."""
+    found = explain("deploy/scenes/beam.toml", ["solver.precision=float32"], "gpu")
+    asked = {each.name: each for each in found.asked}
+    assert (asked["gravity"].bytes, asked["gravity"].device_bytes) == (24, 12)
+    assert asked["corotational"].device_bytes > 0 and found.device == "gpu"
+    assert asked["gravity"].kernels == {"effects/gravity.cu": ["gravity"]}
+    owners = {row.kernel: row.asker for row in found.launches}
+    assert owners["touch.apply"] == "touch" and owners["nodes.start"] == "core"
