@@ -139,7 +139,7 @@ def capture(simulation: Simulation, driver: Driver, software: str) -> Checkpoint
         bodies.append(entry)
     manifest = Manifest(
         format="", version=0, software=software, device=simulation.world.backend.name,
-        build=simulation.world.backend.build(), scene=simulation.scene.name, digest=digest(simulation.scene.resolved()),
+        build=simulation.build_id(), scene=simulation.scene.name, digest=digest(simulation.scene.resolved()),
         resolved=simulation.scene.resolved(), step=engine.step, start_time=engine.loop.start_time, bodies=bodies,
         interactions=[_touch_entry(a) for a in interactions], last_interaction=touch.last_id if touch else 0,
         parameters=simulation.parameters.changed,

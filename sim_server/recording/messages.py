@@ -36,10 +36,17 @@ def scene(simulation: Simulation) -> pb.Scene:
         resolved=json.dumps(s.resolved()),
         dt=s.dt,
         started_ns=time.time_ns(),
-        software=f"warpfactor {version()}, {simulation.world.backend.name}, Python {platform.python_version()}",
+        software=", ".join(
+            [
+                f"warpfactor {version()}",
+                simulation.world.backend.name,
+                f"Python {platform.python_version()}",
+                *map(str, simulation.codes_outside),
+            ]
+        ),
         objects=[b.name for b in simulation.world.bodies],
         device=simulation.world.backend.name,
-        build=simulation.world.backend.build(),
+        build=simulation.build_id(),
         obstacles=simulation.posed_names,
     )
 
