@@ -20,6 +20,7 @@ PAGES = (
     "verification",
     "accuracy",
     "hard_cases",
+    "effects",
     "scheduler",
     "scaling",
     "haptics",

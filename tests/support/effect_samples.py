@@ -1,0 +1,95 @@
+# SPDX-License-Identifier: MIT
+"""A sample of parameters for each effect, and scenes with and without it. Nothing of the server is imported here."""
+
+import json
+from dataclasses import dataclass, field
+from typing import Any
+
+LAW: dict[str, Any] = {"young": 1e6, "poisson": 0.45}
+HELD: dict[str, Any] = {"fixed": {"where": "Z < 0.001"}}
+BASE: dict[str, Any] = HELD | {"corotational": LAW}
+HYPERELASTIC: dict[str, Any] = HELD | {"neo_hookean": LAW}
+LOAD: dict[str, Any] = {"where": "Z > 3.999", "force": [0, -100, 0]}
+BULK = 3e6  # Pa
+FLOOR = '[[obstacle]]\nname = "floor"\nshape = "plane"\npose = { translate = [0, -1, 0] }\n'
+
+
+@dataclass(frozen=True)
+class Sample:
+    """Parameters of an effect, and what a scene needs to list it.
+
+    table: of the effect. scene: listed under [effects]
+    beside, of_scene: effects of the object and of the scene, with it and without
+    more: tables of the scene with it. elements: of the object, with it and without
+    """
+
+    table: Any
+    scene: bool = False
+    beside: dict[str, Any] = field(default_factory=lambda: BASE)
+    of_scene: dict[str, Any] = field(default_factory=lambda: {"gravity": True})
+    more: str = ""
+    elements: str = "linear"
+
+
+SAMPLES: dict[str, Sample] = {
+    "arruda_boyce": Sample({"shear": 3e5, "segments": 8.0, "bulk": BULK}),
+    "contact": Sample(True, scene=True, more=FLOOR),
+    "corotational": Sample(LAW, beside=HYPERELASTIC),
+    "costa": Sample({"a": 1e5, "bulk": BULK, "fibre": [0, 0, 1], "sheet": [1, 0, 0]}),
+    "fibres": Sample({"stiffness": 1e5, "exponent": 1.0, "direction": [0, 0, 1]}, beside=HYPERELASTIC),
+    "fixed": Sample(HELD["fixed"], beside={"corotational": LAW}),
+    "gravity": Sample(True, scene=True, beside=BASE | {"traction": LOAD}, of_scene={}),
+    "mass_spring": Sample({"young": 1e6}),
+    "mooney_rivlin": Sample({"c1": 1.5e5, "c2": 2e4, "bulk": BULK}),
+    "neo_hookean": Sample(LAW),
+    "ogden": Sample({"mu": [4e5, 1e4], "alpha": [1.3, 5.0], "bulk": BULK}),
+    "rayleigh": Sample({"mass": 0.5, "stiffness": 0.01}),
+    "st_venant_kirchhoff": Sample(LAW),
+    "stable_neo_hookean": Sample(LAW),
+    "touch": Sample(True),
+    "traction": Sample(LOAD),
+    "veronda_westmann": Sample({"c1": 8e4, "c2": 2.0, "bulk": BULK}),
+}
+
+
+def scene_text(
+    name: str, cells: tuple[int, int, int], listed: bool, solver: str = 'preconditioner = "block_jacobi"'
+) -> str:
+    """Returns a scene with a beam of 1 x 1 x 4 m: with the sample of an effect, or the same without it.
+
+    solver: lines of [solver]
+    """
+    sample = SAMPLES[name]
+    effects = sample.beside | ({name: sample.table} if listed and not sample.scene else {})
+    of_scene = sample.of_scene | ({name: sample.table} if listed and sample.scene else {})
+    return "\n".join([
+        "dt = 0.02", "[effects]", *_lines(of_scene), "[solver]", solver, "[[object]]", 'name = "beam"',
+        f"mesh = {{ bar = {list(cells)}, size = [1, 1, 4] }}", f'elements = "{sample.elements}"', "[object.effects]",
+        *_lines(effects), sample.more if listed else "",
+    ])  # fmt: skip
+
+
+def _lines(tables: dict[str, Any]) -> list[str]:
+    return [f"{name} = {toml(table)}" for name, table in tables.items()]
+
+
+def toml(value: Any) -> str:
+    """A value as TOML, tables inline."""
+    if isinstance(value, dict):
+        return "{ " + ", ".join(f"{key} = {toml(each)}" for key, each in value.items()) + " }"
+    if isinstance(value, list | tuple):
+        return "[" + ", ".join(map(toml, value)) + "]"
+    return json.dumps(value)
+
+
+def files_of(name: str, there: list[str], known: list[str]) -> list[str]:
+    """Returns those files of sim_server/effects that are an effect's: its module and texts with its name in front.
+
+    there: names of files; known: effects, as that of a text is the longest that it begins with
+    """
+
+    def owner(file: str) -> str:
+        stem = file.split(".")[0]
+        return max((e for e in known if f"{stem}_".startswith(f"{e}_")), key=len, default="")
+
+    return [file for file in there if owner(file) == name]
