@@ -29,8 +29,8 @@ The scene without the effect, by a copy of the packages, and by one in which the
 (sim_server/effects: its module, its kernel texts), each in a process of its own; batches in turns, times as above, with
 block Jacobi for a preconditioner. State: positions and velocities after some steps, to the bit. Launches, texts that
 are compiled, modules that are imported: the whole lists. Kernels, bytes, keys and channels: what the one asks for more
-than the other. The ratio is that of the medians; the range, of the ratios of single rounds, tells how far times of
-equal programs are apart."""
+than the other. The ratio is the median of those of each round; their range tells how far times of equal programs are
+apart."""
 
 
 def diagram(rows: list[Row]) -> Any:
@@ -46,7 +46,9 @@ def diagram(rows: list[Row]) -> Any:
 
 def main(
     effects: Annotated[list[str] | None, typer.Option("--effect", help="One of those measured [default: all]")] = None,
-    rounds: Annotated[int, typer.Option(min=2, help="Batches of steps of each scene")] = 30,
+    rounds: Annotated[
+        int, typer.Option(min=2, help="Batches of steps of each scene; without an effect twice as many")
+    ] = 30,
     starts: Annotated[int, typer.Option(min=1, help="Pairs of processes without an effect")] = 3,
     quick: Annotated[bool, typer.Option("--quick", help="A small smoke run")] = False,
     out: Annotated[Path | None, typer.Option(help="Folder of the results [default: out/bench/effects]")] = None,
@@ -66,7 +68,7 @@ def main(
         copy_packages(whole)
         for name in names:
             costs.append(cost(name, cells, rounds, Path(folder)))
-            absences.append(absence(name, cells, max(2, rounds // starts), starts, whole, Path(folder)))
+            absences.append(absence(name, cells, 2 * rounds, starts, whole, Path(folder)))
             print(
                 f"{name}: {costs[-1]['ratio']:.3f} with it, {absences[-1]['ratio']:.3f} without its files", flush=True
             )
