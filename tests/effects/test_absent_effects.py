@@ -10,7 +10,7 @@ import pytest
 
 from sim_server.effects import effect, known_effects
 from tests.support.absent_effect import ask, copy_packages, start
-from tests.support.effect_samples import SAMPLES, files_of, scene_text
+from tests.support.effect_samples import SAMPLES, files_of, write_scene
 
 CELLS, STEPS = (1, 1, 3), 8
 EFFECTS = known_effects()
@@ -27,7 +27,7 @@ class Forks:
     def of(self, name: str, listed: bool, without: list[str]) -> dict:
         """Report of the scene of an effect. listed: with it; without: files that are not there."""
         path = self.folder / f"{name}.toml"
-        path.write_text(scene_text(name, CELLS, listed))
+        write_scene(path, name, CELLS, listed)
         return ask(self._process, json.dumps({"scene": str(path), "steps": STEPS, "without": without}))
 
     def close(self) -> None:

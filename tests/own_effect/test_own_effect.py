@@ -63,6 +63,15 @@ def test_nothing_is_looked_for_where_no_scene_lists_it(installed: Path) -> None:
     assert python(installed, "-c", load + show).strip() == "[]"
 
 
+def test_a_name_of_the_tree_is_that_of_the_tree(tmp_path: Path) -> None:
+    """An entry point of the same name is not read: its module does not exist."""
+    install(tmp_path)
+    metadata(tmp_path, "wrong-gravity", "1", "[warpfactor.effects]\ngravity = module_that_is_not_there\n")
+    (tmp_path / "scene.toml").write_text(SCENE.replace("[solver]", "[effects]\ngravity = true\n[solver]"))
+    found = json.loads(python(tmp_path, "-m", "sim_server", "scene.toml", "--explain", "--json"))
+    assert {"gravity", "trap"} <= {each["name"] for each in found["asked"]}
+
+
 def test_a_run_is_logged_and_repeated_and_refused_without_it(installed: Path, tmp_path: Path) -> None:
     log = tmp_path / "run.mcap"
     arguments = ["--free-run", "--steps", "20", "--quiet", "--listen", "tcp/127.0.0.1:0", "--record", log]

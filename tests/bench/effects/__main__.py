@@ -9,10 +9,10 @@ import typer
 
 from sim_server.effects import known_effects
 from tests.bench.effects.absence import absence
-from tests.bench.effects.cost import Cells, Row, cost
+from tests.bench.effects.cost import Row, cost
 from tests.bench.harness.report import Report, plots
 from tests.support.absent_effect import copy_packages
-from tests.support.effect_samples import SAMPLES
+from tests.support.effect_samples import SAMPLES, Cells
 
 SMOKE = ("gravity", "rayleigh", "contact")
 COSTS = """\

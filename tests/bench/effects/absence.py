@@ -15,9 +15,9 @@ from typing import Any
 import numpy as np
 
 from sim_server.effects import known_effects
-from tests.bench.effects.cost import Cells, Row
+from tests.bench.effects.cost import Row
 from tests.support.absent_effect import ROOT, ask, copy_packages, start
-from tests.support.effect_samples import files_of, scene_text
+from tests.support.effect_samples import Cells, files_of, write_scene
 
 FIRST = 20  # steps whose results are compared
 BATCH = 5  # steps: short, so that what else runs on the machine slows both of a round
@@ -27,7 +27,7 @@ SAME = ("state", "launches", "texts", "modules")
 def absence(name: str, cells: Cells, rounds: int, starts: int, whole: Path, folder: Path) -> Row:
     """Returns what differs. starts: pairs of processes; rounds: batches of each. whole: a copy of the packages."""
     scene, without = folder / f"{name}.toml", folder / "without"
-    scene.write_text(scene_text(name, cells, listed=False))
+    write_scene(scene, name, cells, listed=False)
     there = [f.name for f in (ROOT / "sim_server" / "effects").iterdir() if f.is_file()]
     removed = files_of(name, there, known_effects())
     copy_packages(without, removed)

@@ -11,12 +11,11 @@ import numpy as np
 from sim_server.explain.explanation import Asked, explain
 from sim_server.simulation import Simulation
 from sim_server.updates.driver import Driver
-from tests.support.effect_samples import scene_text
+from tests.support.effect_samples import Cells, write_scene
 
 FACTOR = 'preconditioner = "cholesky"\nupdate = "every-1"'
 BATCH = 10  # steps, after one that makes a factor: what it costs is not counted
 
-Cells = tuple[int, int, int]
 Row = dict[str, Any]
 
 
@@ -50,7 +49,7 @@ def cost(name: str, cells: Cells, rounds: int, folder: Path) -> Row:
     paths = []
     for listed in (False, True):
         paths.append(folder / f"{name}_{'with' if listed else 'without'}.toml")
-        paths[-1].write_text(scene_text(name, cells, listed, FACTOR))
+        write_scene(paths[-1], name, cells, listed, FACTOR)
     asked: Asked = next(each for each in explain(paths[1]).asked if each.name == name)
     base, full = map(Runner.of, paths)
     for k in range(rounds):
