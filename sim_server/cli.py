@@ -125,7 +125,7 @@ def serve(
     if json and not explain:
         PROGRAM.bad_input("--json goes with --explain alone")
     if explain:
-        explain_scene(scene, set_ or [], device, json)
+        explain_scene(scene, set_ or [], device, name, json)
         return
     service: Service | None = None
     code = 0
@@ -160,14 +160,16 @@ def serve(
     raise typer.Exit(code)
 
 
-def explain_scene(scene: Path, overrides: list[str], device: str, json: bool) -> None:
+def explain_scene(scene: Path, overrides: list[str], device: str, name: str, json: bool) -> None:
     """Shows what each effect of a scene asks for (--explain); exits with code 2 on bad input."""
+    from protocol.channels import check_name
+    from protocol.refused import Refused
     from sim_server.backends.compiler import CompileError
     from sim_server.explain.explanation import explain
 
     try:
-        found = explain(scene, overrides, choose_device(device, lambda text: None))
-    except (InputError, CompileError) as error:
+        found = explain(scene, overrides, choose_device(device, lambda text: None), check_name(name, "--name"))
+    except (InputError, CompileError, Refused) as error:
         PROGRAM.bad_input(str(error))
     if json:
         from json import dumps

@@ -8,6 +8,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
+from protocol.channels import SERVER_NAME
 from sim_server.backends import compiler
 from sim_server.backends.base import Launch
 from sim_server.errors import DeviceError, InputError
@@ -96,9 +97,12 @@ class _Texts(list[str]):
         self.askers.append(asker())
 
 
-def explain(path: str | Path, overrides: Sequence[str] = (), device: str = "cpu") -> Explanation:
+def explain(
+    path: str | Path, overrides: Sequence[str] = (), device: str = "cpu", server: str = SERVER_NAME
+) -> Explanation:
     """Builds a scene and returns what it asked for; whole only in a process that has built none before.
 
+    server: its name in keys of the network
     Raises InputError, DeviceError where there is no such device.
     """
     before = set(sys.modules)
@@ -114,7 +118,7 @@ def explain(path: str | Path, overrides: Sequence[str] = (), device: str = "cpu"
         asked = {name: Asked(name) for name in names}
         rows = list(_launches(simulation))
         _count(simulation, asked, rows)
-        for name, told in topics(simulation).items():  # last: their commands make arrays, too
+        for name, told in topics(simulation, server).items():  # last: their commands make arrays, too
             asked[name].network, asked[name].log = sorted(told.network), sorted(told.log)
     for text, who in zip(texts, texts.askers, strict=True):
         if text.endswith(".cpp"):

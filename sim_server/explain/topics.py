@@ -46,8 +46,8 @@ class Topics:
 class NotedLink(ServerLink):
     """The server's side of a network that is not there; everybody subscribes to everything. found: keys."""
 
-    def __init__(self) -> None:
-        self.name, self.incarnation, self.found = key("status").split("/")[1], 1, set[str]()
+    def __init__(self, name: str) -> None:
+        self.name, self.incarnation, self.found = name, 1, set[str]()
         self.counters = Counters(SimpleNamespace(warning=lambda *_: None))  # type: ignore[arg-type]
         self.local_workers = list
         queue: Any = SimpleNamespace(post=lambda *_: True)
@@ -78,30 +78,31 @@ class NotedRecorder(Recorder):
         self.found.add(topic)
 
 
-def topics(simulation: Simulation) -> dict[str, Topics]:
-    """Returns those of each effect, and those of any scene with these objects, CORE."""
-    without = _told(simulation, {})
-    found = {CORE: Topics(without.network | _always(simulation), without.log)}
+def topics(simulation: Simulation, server: str) -> dict[str, Topics]:
+    """Returns those of each effect, and those of any scene with these objects, CORE. server: its name in keys."""
+    without = _told(simulation, server, {})
+    found = {CORE: Topics(without.network | _always(simulation, server), without.log)}
     for name in dict.fromkeys(e.name for e in simulation.effects.values()):
         alone = {key: e for key, e in simulation.effects.items() if e.name == name}
-        found[name] = _told(simulation, alone).beyond(found[CORE])
+        found[name] = _told(simulation, server, alone).beyond(found[CORE])
     return found
 
 
-def _always(simulation: Simulation) -> set[str]:
+def _always(simulation: Simulation, server: str) -> set[str]:
     """Keys that a server subscribes to or answers, whatever its scene."""
     wanted = simulation.scene.solver.wants_factors
     of_workers = [name for name, c in CHANNELS.items() if c.sender == "worker" and name != "echo"]
-    return {key(name) for name in (*QUERYABLES, "alive_server", "alive_client", *(of_workers if wanted else ()))}
+    names = (*QUERYABLES, "alive_server", "alive_client", *(of_workers if wanted else ()))
+    return {key(name, server) for name in names}
 
 
-def _told(simulation: Simulation, effects: dict[str, Effect]) -> Topics:
+def _told(simulation: Simulation, server: str, effects: dict[str, Effect]) -> Topics:
     """What is sent and written of a simulation with these effects alone, by a step, a command and an update of each."""
     view = copy.copy(simulation)
     view.effects, view.on_effect_update = effects, []
     view.parameters = copy.copy(simulation.parameters)
     view.parameters.on_set = []
-    link, recorder = NotedLink(), NotedRecorder()
+    link, recorder = NotedLink(server), NotedRecorder()
     commands = Commands(view, recorder.interaction)
     telemetry = Telemetry(Driver(view), link, recorder, False, commands)
     telemetry.open()

@@ -158,6 +158,7 @@ def test_no_step_is_made_and_the_tables_name_every_effect(tmp_path):
     (tmp_path / "scene.toml").write_text(SCENE)
     run = program(tmp_path / "scene.toml", "--explain")
     assert run.returncode == 0 and "no step was made" in run.stdout
+    assert "warpfactor/other/state/block" in program(tmp_path / "scene.toml", "--explain", "--name", "other").stdout
     for words in ("corotational.elements", "/interaction/block", "sim_server.effects.gravity", "total"):
         assert words in run.stdout
 
