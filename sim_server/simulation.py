@@ -12,7 +12,7 @@ record  service/telemetry.py fetches those of the engine (`records`) for recordi
 """
 
 import hashlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
@@ -76,7 +76,7 @@ class Simulation:
 
     def make_effects(self) -> dict[str, Effect]:
         """Returns the effects that the scene lists, and no others, by name (and variant)."""
-        return dict(each_effect(self.scene, self.world))
+        return build_effects(self.scene, self.world)
 
     def _build(self, backend: Backend, watched: bool) -> None:
         scene, solver = self.scene, self.scene.solver
@@ -352,23 +352,21 @@ class Simulation:
         return bsr_array((self.system.body_values(b.first, b.last).copy(), columns, row_start), shape=(n, n)).tocsc()
 
 
-def each_effect(scene: Scene, world: World) -> Iterator[tuple[str, Effect]]:
-    """Builds the effects that the scene lists, and no others, one by one; yields each with its name (and variant)."""
+def build_effects(scene: Scene, world: World, built: dict[str, Effect] | None = None) -> dict[str, Effect]:
+    """The effects that the scene lists, and no others, by name (and variant). built: takes each as it is made."""
+    built = {} if built is None else built
     if world.holders:
         from sim_server.effects._holders import Holders
 
-        yield "holders", Holders(world)
+        built["holders"] = Holders(world)
     for name in sorted({n for o in scene.objects for n in o.effects}):
         variants: dict[str, list[tuple[Body, Any]]] = {}
         for body, params in world.with_effect(name):
             variants.setdefault(params.variant_of(body.elements), []).append((body, params))
         for variant, listed in variants.items():
-            yield name + variant, _built(name, world, listed)
+            built[name + variant] = effect(name).build(world, listed)
+            built[name + variant].name = name
     for name, params in sorted(scene.effects.items(), key=lambda item: item[0] != "gravity"):  # contact asks for it
-        yield name, _built(name, world, [(body, params) for body in world.bodies])
-
-
-def _built(name: str, world: World, listed: list[tuple[Body, Any]]) -> Effect:
-    made: Effect = effect(name).build(world, listed)
-    made.name = name
-    return made
+        built[name] = effect(name).build(world, [(body, params) for body in world.bodies])
+        built[name].name = name
+    return built

@@ -12,7 +12,7 @@ from sim_server.explain.memory import Memory
 from sim_server.mechanics.system import System
 from sim_server.mechanics.world import World
 from sim_server.scene import Scene
-from sim_server.simulation import Simulation, each_effect
+from sim_server.simulation import Simulation, build_effects
 
 
 class Notes:
@@ -79,6 +79,20 @@ class NotedBackend:
         self._backend.keep(*hosts, exact=exact)
 
 
+class _Built(dict[str, Effect]):
+    """Effects by name and variant; their arrays are noted as they are made, also those that they put into the world."""
+
+    def __init__(self, world: World, memory: Memory, names: set[str]):
+        super().__init__()
+        self._world, self._memory, self._names = world, memory, names
+
+    def __setitem__(self, key: str, effect: Effect) -> None:
+        super().__setitem__(key, effect)
+        name = max((n for n in self._names if key.startswith(n)), key=len, default=key)
+        self._memory.take_all(effect, name)
+        self._memory.take_all(self._world, name)
+
+
 class NotedSimulation(Simulation):
     """A simulation, with notes of who asked for what while it was built.
 
@@ -98,14 +112,9 @@ class NotedSimulation(Simulation):
         return made  # type: ignore[no-any-return]
 
     def make_effects(self) -> dict[str, Effect]:
-        memory = self.notes.memory
-        memory.take_all(self.world, CORE)
-        made = {}
-        for name, effect in each_effect(self.scene, self.world):
-            made[name] = effect
-            memory.take_all(effect, effect.name)
-            memory.take_all(self.world, effect.name)  # what it has put there
-        return made
+        self.notes.memory.take_all(self.world, CORE)
+        names = {*self.scene.effects, *(name for o in self.scene.objects for name in o.effects)}
+        return build_effects(self.scene, self.world, _Built(self.world, self.notes.memory, names))
 
     def engine_input(self) -> EngineInput:
         self.given = super().engine_input()
