@@ -11,7 +11,6 @@ push    service/commands.py carries it out on effects/touch.py, which calls `upd
 record  service/telemetry.py fetches those of the engine (`records`) for recording/recorder.py and network/publishers.py
 """
 
-import hashlib
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
@@ -23,7 +22,7 @@ from sim_server import backends
 from sim_server.backends.base import Backend, Capability, EngineInput, Launch, PendingUpdate
 from sim_server.backends.compiler import ahead
 from sim_server.backends.kinds import FACTOR_TRUST, WARPED_TRUST, Kind
-from sim_server.effects import codes_outside, effect
+from sim_server.effects import effect
 from sim_server.effects._base import Effect, Refusal
 from sim_server.errors import DeviceError, InputError
 from sim_server.mechanics.energy import collected_energies
@@ -41,7 +40,6 @@ if TYPE_CHECKING:
 
     from sim_server.effects._holders import Holders  # imported where a scene has them
     from sim_server.effects._movable import Movable
-    from sim_server.effects._outside import Code
     from sim_server.effects.contact import Contact  # imported where a scene lists it
     from sim_server.effects.touch import Touch  # imported where a scene lists it
 
@@ -251,16 +249,6 @@ class Simulation:
         for observe in self.on_effect_update:
             observe(effect, pending)
         return pending
-
-    @property
-    def codes_outside(self) -> "list[Code]":
-        """What code the effects of other packages are."""
-        return codes_outside({*self.scene.effects, *(name for o in self.scene.objects for name in o.effects)})
-
-    def build_id(self) -> str:
-        """Returns a digest of what a run depends on beside its scene: equal ones repeat it bit for bit."""
-        built, codes = self.world.backend.build(), self.codes_outside
-        return hashlib.sha256("\0".join([built, *map(str, codes)]).encode()).hexdigest()[:24] if codes else built
 
     @property
     def touch(self) -> "Touch | None":

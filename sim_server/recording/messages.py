@@ -23,6 +23,7 @@ from sim_server.parameters import LiveParameter, ParameterUpdate
 from sim_server.recording.object_steps import Reactions, object_step, rows
 from sim_server.scene.solver_options import FACTORS
 from sim_server.simulation import Simulation
+from sim_server.state import code
 
 NAMES = {kind: kind.name.lower() for kind in Kind}
 
@@ -41,12 +42,12 @@ def scene(simulation: Simulation) -> pb.Scene:
                 f"warpfactor {version()}",
                 simulation.world.backend.name,
                 f"Python {platform.python_version()}",
-                *map(str, simulation.codes_outside),
+                *map(str, code.codes(simulation)),
             ]
         ),
         objects=[b.name for b in simulation.world.bodies],
         device=simulation.world.backend.name,
-        build=simulation.build_id(),
+        build=code.build_id(simulation),
         obstacles=simulation.posed_names,
     )
 

@@ -34,6 +34,7 @@ from sim_server.replay.report import Comparison
 from sim_server.scene import Scene, deleted, earlier_defaults
 from sim_server.scene.messages import readable
 from sim_server.simulation import Simulation
+from sim_server.state import code
 from sim_server.state.start import Start
 from sim_server.updates.factor_source import Inline, Job
 from sim_server.updates.worker_assembly import Assembly
@@ -103,7 +104,7 @@ class Replay:
                 self._inline.submit(job)
         self._collect(recording.first)
         self._same_effects()
-        if self.simulation.build_id() != recording.scene.build and recording.scene.build:
+        if code.build_id(self.simulation) != recording.scene.build and recording.scene.build:
             self.compared.notes.append(
                 "another build than the recorded one (kernels, compiler, processor or GPU): last digits may differ"
             )
@@ -177,10 +178,10 @@ class Replay:
 
     def _same_effects(self) -> None:
         """Notes effects of other packages that are not the recorded ones."""
-        for code in self.simulation.codes_outside:
-            if str(code) not in self.recording.scene.software:
+        for other in code.codes(self.simulation):
+            if str(other) not in self.recording.scene.software:
                 self.compared.notes.append(
-                    f"{code} is not the code of the log: recorded with {self.recording.scene.software}"
+                    f"{other} is not the code of the log: recorded with {self.recording.scene.software}"
                 )
 
     def _same_obstacles(self) -> None:

@@ -17,6 +17,7 @@ from sim_server.checkpoint.content import capture
 from sim_server.explain.explanation import explain
 from sim_server.simulation import Simulation
 from sim_server.state.arrays import state_arrays
+from sim_server.state.code import build_id
 from sim_server.state.start import Start
 from sim_server.updates.driver import Driver
 from tests.backends import fake_cupy
@@ -382,4 +383,4 @@ def test_an_effect_of_another_package_is_put_together_with_the_others(cupy, tmp_
     simulation.engine.run(2)
     assert "trap.pull" in [launch.name for launch in simulation.step_launches]
     assert any("::pull_item(" in code and "::gather" in code and "trap_law.cuh" in code for code in sources)
-    assert len(simulation.build_id()) == 24
+    assert len(build_id(simulation)) == 24

@@ -113,7 +113,7 @@ def _answer(scene: str, steps: int) -> None:
     except Exception as error:
         found = {"error": f"{type(error).__name__}: {error}"}
     print(json.dumps(found), flush=True)
-    os._exit(0)
+    sys.exit()
 
 
 if __name__ == "__main__":
