@@ -16,7 +16,7 @@ LOAD: dict[str, Any] = {"where": "Z > 3.999", "force": [0, -100, 0]}
 EVEN = ((0, 1, 2), (1, 2, 0), (2, 0, 1))  # permutations
 BULK = 3e6  # Pa
 INSIDE = "max(2 * max(abs(X - 0.5), abs(Y - 0.5)), abs(Z - 2) / 2) < 0.999"  # nodes of a hollow beam
-FLOOR = '[[obstacle]]\nname = "floor"\nshape = "plane"\npose = { translate = [0, -1, 0] }\n'
+FLOOR = '[[obstacle]]\nname = "floor"\nshape = "plane"\npose = { translate = [0, -5, 0] }\n'
 
 
 @dataclass(frozen=True)
