@@ -40,15 +40,18 @@ class Sample:
 
 SAMPLES: dict[str, Sample] = {
     "arruda_boyce": Sample({"shear": 3e5, "segments": 8.0, "bulk": BULK}),
+    "buoyancy": Sample({"level": -0.5}),
     "cable": Sample({"path": [[0.5, 0.5, 0], [0.5, 0.5, 2], [0.5, 0.5, 4]], "tension": 50}),
     "cavity": Sample({"where": INSIDE, "pressure": 100}, hollow=True),
     "contact": Sample(True, scene=True, more=FLOOR),
     "corotational": Sample(LAW, beside=HYPERELASTIC),
     "costa": Sample({"a": 1e5, "bulk": BULK, "fibre": [0, 0, 1], "sheet": [1, 0, 0]}),
     "cutting": Sample(True),
+    "damage": Sample({"strength": 1e4, "fracture_energy": 100}),
     "fibres": Sample({"stiffness": 1e5, "exponent": 1.0, "direction": [0, 0, 1]}, beside=HYPERELASTIC),
     "fixed": Sample(HELD["fixed"], beside={"corotational": LAW}),
     "gravity": Sample(True, scene=True, beside=BASE | {"traction": LOAD}, of_scene={}),
+    "growth": Sample({"expansion": 0.01}),
     "mass_spring": Sample({"young": 1e6}),
     "mooney_rivlin": Sample({"c1": 1.5e5, "c2": 2e4, "bulk": BULK}),
     "muscle": Sample({"stress": 1e3, "direction": [0, 0, 1]}),
@@ -62,6 +65,7 @@ SAMPLES: dict[str, Sample] = {
     "touch": Sample(True),
     "traction": Sample(LOAD),
     "veronda_westmann": Sample({"c1": 8e4, "c2": 2.0, "bulk": BULK}),
+    "wind": Sample({"velocity": [5, 0, 0]}),
 }
 
 
