@@ -62,6 +62,7 @@ SAMPLES: dict[str, Sample] = {
     "rayleigh": Sample({"mass": 0.5, "stiffness": 0.01}),
     "st_venant_kirchhoff": Sample(LAW),
     "stable_neo_hookean": Sample(LAW),
+    "target": Sample({"to": ["X", "Y", "Z + 0.1"], "stiffness": 1e4}),
     "touch": Sample(True),
     "traction": Sample(LOAD),
     "veronda_westmann": Sample({"c1": 8e4, "c2": 2.0, "bulk": BULK}),
