@@ -42,6 +42,8 @@ Examples:
         with other values than the scene's
   sim-server beam.toml --set @beam.plan.toml
         with those that the file lists
+  sim-server beam.toml --explain
+        what each effect of the scene asks for: launches, memory, keys, ...
 """
 
 WORKER_TIMEOUT = 15.0  # s that the start waits for the first local worker, at most
@@ -102,6 +104,10 @@ def serve(
     name: Annotated[str, typer.Option(metavar="NAME", help="Name of this server in all keys")] = "sim",
     no_shared_memory: Annotated[bool, typer.Option("--no-shared-memory", help="Send arrays as bytes")] = False,
     quiet: Annotated[bool, typer.Option("--quiet", help="Say nothing but errors")] = False,
+    explain: Annotated[
+        bool, typer.Option("--explain", help="Show what each effect of the scene asks for, and end; no step is made")
+    ] = False,
+    json: Annotated[bool, typer.Option("--json", help="Of --explain: as JSON on one line")] = False,
     list_: Annotated[
         bool,
         typer.Option("--list", callback=list_gallery, is_eager=True, help="Show the scenes that come along"),
@@ -116,6 +122,11 @@ def serve(
     if worker_device not in ("auto", "cpu", "gpu"):
         PROGRAM.bad_input(f"--worker-device {worker_device}: allowed are auto, cpu, gpu")
     say = (lambda text: None) if quiet else (lambda text: print(f"sim-server: {text}", flush=True))
+    if json and not explain:
+        PROGRAM.bad_input("--json goes with --explain alone")
+    if explain:
+        explain_scene(scene, set_ or [], device, name, json)
+        return
     service: Service | None = None
     code = 0
     try:
@@ -147,6 +158,27 @@ def serve(
         print(f"sim-server: exit code 1: the log {record} ends before the run does", file=sys.stderr)
         code = 1
     raise typer.Exit(code)
+
+
+def explain_scene(scene: Path, overrides: list[str], device: str, name: str, json: bool) -> None:
+    """Shows what each effect of a scene asks for (--explain); exits with code 2 on bad input."""
+    from protocol.channels import check_name
+    from protocol.refused import Refused
+    from sim_server.backends.compiler import CompileError
+    from sim_server.explain.explanation import explain
+
+    try:
+        found = explain(scene, overrides, choose_device(device, lambda text: None), check_name(name, "--name"))
+    except (InputError, CompileError, Refused) as error:
+        PROGRAM.bad_input(str(error))
+    if json:
+        from json import dumps
+
+        print(dumps(found.json()))
+        return
+    from sim_server.explain.tables import show
+
+    show(found)
 
 
 def choose_device(device: str, say: Callable[[str], None]) -> str:

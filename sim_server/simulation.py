@@ -59,7 +59,7 @@ class Simulation:
     def __init__(self, scene: Scene, device: str = "cpu", watched: bool = True):
         self.scene = scene
         scene.check_device(device)
-        backend = backends.create(device, scene.solver.precision)
+        backend = self.make_backend(device)
         if scene.solver.wants_factors:
             ahead("backends/cpu/native/factor_check.cpp")
         self.on_effect_update: list[Callable[[Effect, PendingUpdate], None]] = []
@@ -70,10 +70,18 @@ class Simulation:
             self._build(backend, watched)
         self.parameters = LiveParameters(self)
 
+    def make_backend(self, device: str) -> Backend:
+        """Returns the place where the kernels of this scene run."""
+        return backends.create(device, self.scene.solver.precision)
+
+    def make_effects(self) -> dict[str, Effect]:
+        """Returns the effects that the scene lists, and no others, by name (and variant)."""
+        return build_effects(self.scene, self.world)
+
     def _build(self, backend: Backend, watched: bool) -> None:
         scene, solver = self.scene, self.scene.solver
         self.world = World(scene, backend)
-        self.effects = build_effects(scene, self.world)
+        self.effects = self.make_effects()
         self.ties = self.contact.contact_input().ties if self.contact else make_ties(self.world)
         if self.holders and self.touch:
             self.holders.use_load(self.touch.force)
@@ -352,9 +360,9 @@ def _order(effect: Effect) -> tuple[bool, bool]:
     return not effect.comes_first, effect.elements is None
 
 
-def build_effects(scene: Scene, world: World) -> dict[str, Effect]:
-    """The effects that the scene lists, and no others, by name (and variant)."""
-    built: dict[str, Effect] = {}
+def build_effects(scene: Scene, world: World, built: dict[str, Effect] | None = None) -> dict[str, Effect]:
+    """The effects that the scene lists, and no others, by name (and variant). built: takes each as it is made."""
+    built = {} if built is None else built
     if world.holders:
         from sim_server.effects._holders import Holders
 

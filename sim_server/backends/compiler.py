@@ -78,15 +78,30 @@ def _make(folder: Path) -> None:
 
 
 def read_text(path: str) -> tuple[str, str]:
-    """Name and text of a kernel text of this package.
+    """Name and text of a kernel text of this package, or of another by its absolute path. Raises CompileError.
 
     "a.cu+b.cuh" is the text a.cu with b.cuh in place of its line `#include LAW`, and its name is b.
     """
-    frame, _, law = path.partition("+")
-    text = (SOURCES / frame).read_text()
-    if not law:
-        return Path(frame).stem, text
-    return Path(law).stem, text.replace("#include LAW\n", (SOURCES / law).read_text())
+    frame, law = _parts(path)
+    try:
+        text = (SOURCES / frame).read_text()
+        if not law:
+            return Path(frame).stem, text
+        return Path(law).stem, text.replace("#include LAW\n", (SOURCES / law).read_text())
+    except OSError as error:
+        raise CompileError(f"kernel text {path}: {error.strerror}") from error
+
+
+def _parts(path: str) -> tuple[str, str]:
+    frame, law, name = path.partition(".cu+")
+    return (f"{frame}.cu", name) if law else (path, "")
+
+
+def folder_outside(path: str) -> Path | None:
+    """Folder of a kernel text that is of another package, where its own headers are; None for one of this package."""
+    frame, law = _parts(path)
+    source = SOURCES / (law or frame)
+    return None if source.is_relative_to(SOURCES) else source.parent
 
 
 def begin(source: Path, defines: tuple[str, ...] = (), text: str | None = None) -> Path:
@@ -104,7 +119,8 @@ def begin(source: Path, defines: tuple[str, ...] = (), text: str | None = None) 
     if not library.exists():
         _make(library.parent)
         file = str(source) if text is None else "-"
-        command = [compiler(), *flags, "-x", "c++", f"-I{INCLUDE}", file]
+        own = [] if source.is_relative_to(SOURCES) else [f"-I{source.parent}"]
+        command = [compiler(), *flags, "-x", "c++", f"-I{INCLUDE}", *own, file]
         compilers.begin(Job(source.name, library, command, text))
     return library
 
@@ -126,8 +142,9 @@ def build(source: Path, stepping: bool = True) -> Path:
 
 def begin_kernels(path: str, text: str, defines: tuple[str, ...]) -> Path:
     """As `begin`, of a kernel text of this package as read_text gives it; notes that this process uses it."""
-    source = SOURCES / path.rpartition("+")[2]
-    library = begin(source, defines, text if "+" in path else None)
+    frame, law = _parts(path)
+    source = SOURCES / (law or frame)
+    library = begin(source, defines, text if law else None)
     used(source, library)
     return library
 

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from sim_server.backends.build_pool import CompileError
-from sim_server.backends.compiler import read_text
+from sim_server.backends.compiler import folder_outside, read_text
 from sim_server.backends.declarations import NUMBERS, split_members
 
 REALS_AND_INT = ("int", "float", "double")
@@ -81,11 +81,14 @@ def domain_of(text: str, struct: str) -> str:
 
 
 class KernelText:
-    """A kernel text of this package. path: as of compiler.read_text. types: what `real` and `local` stand for."""
+    """A kernel text. path: as of compiler.read_text. types: what `real` and `local` stand for.
+
+    folder: of a text of another package
+    """
 
     def __init__(self, path: str, types: dict[str, str]):
         self.name, self.text = read_text(path)
-        self.types = types
+        self.types, self.folder = types, folder_outside(path)
 
 
 class BoundKernel:
@@ -98,7 +101,7 @@ class BoundKernel:
 
     def __init__(self, of: KernelText, kernel: str, given: dict[str, Any], converts: bool = False):
         self.name, self.items = f"{of.name}.{kernel}", int(given["n"])
-        self.text, self.types = of.text, of.types
+        self.text, self.types, self.folder = of.text, of.types, of.folder
         self.fields, self.struct, form = _signature(of.text, kernel, of.name, tuple(of.types.items()))
         self.mailed, self.sums = form == "MAILED_", form == "SUM_"
         if set(given) != {f.name for f in self.fields}:

@@ -25,6 +25,7 @@ from sim_server.errors import InputError
 from sim_server.scene import Scene, earlier_defaults
 from sim_server.simulation import Simulation
 from sim_server.state.arrays import state_arrays
+from sim_server.state.code import build_id
 from sim_server.updates.driver import Driver
 from sim_server.updates.factor_source import Job
 
@@ -139,7 +140,7 @@ def capture(simulation: Simulation, driver: Driver, software: str) -> Checkpoint
         bodies.append(entry)
     manifest = Manifest(
         format="", version=0, software=software, device=simulation.world.backend.name,
-        build=simulation.world.backend.build(), scene=simulation.scene.name, digest=digest(simulation.scene.resolved()),
+        build=build_id(simulation), scene=simulation.scene.name, digest=digest(simulation.scene.resolved()),
         resolved=simulation.scene.resolved(), step=engine.step, start_time=engine.loop.start_time, bodies=bodies,
         interactions=[_touch_entry(a) for a in interactions], last_interaction=touch.last_id if touch else 0,
         parameters=simulation.parameters.changed,

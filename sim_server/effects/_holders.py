@@ -57,6 +57,8 @@ class Holders(Movable):
     load (nodes, 3): the array `force` of the energy balance, of the effect touch where the scene has it
     """
 
+    name = "holders"
+
     def __init__(self, world: World):
         holders: Sequence[Holder] = world.holders
         masks = []

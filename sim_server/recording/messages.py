@@ -23,6 +23,7 @@ from sim_server.parameters import LiveParameter, ParameterUpdate
 from sim_server.recording.object_steps import Reactions, object_step, rows
 from sim_server.scene.solver_options import FACTORS
 from sim_server.simulation import Simulation
+from sim_server.state import code
 
 NAMES = {kind: kind.name.lower() for kind in Kind}
 
@@ -36,10 +37,17 @@ def scene(simulation: Simulation) -> pb.Scene:
         resolved=json.dumps(s.resolved()),
         dt=s.dt,
         started_ns=time.time_ns(),
-        software=f"warpfactor {version()}, {simulation.world.backend.name}, Python {platform.python_version()}",
+        software=", ".join(
+            [
+                f"warpfactor {version()}",
+                simulation.world.backend.name,
+                f"Python {platform.python_version()}",
+                *map(str, code.codes(simulation)),
+            ]
+        ),
         objects=[b.name for b in simulation.world.bodies],
         device=simulation.world.backend.name,
-        build=simulation.world.backend.build(),
+        build=code.build_id(simulation),
         obstacles=simulation.posed_names,
     )
 

@@ -34,6 +34,7 @@ from sim_server.replay.report import Comparison
 from sim_server.scene import Scene, deleted, earlier_defaults
 from sim_server.scene.messages import readable
 from sim_server.simulation import Simulation
+from sim_server.state import code
 from sim_server.state.start import Start
 from sim_server.updates.factor_source import Inline, Job
 from sim_server.updates.worker_assembly import Assembly
@@ -58,7 +59,8 @@ class Replay:
                 )
             scene, watched = Scene.model_validate(table), "on_runaway" in table.get("solver", {})
         except ValidationError as error:
-            reason = readable(error, f"in {recording.path.name}", table)
+            reason, software = str(readable(error, f"in {recording.path.name}", table)), recording.scene.software
+            reason += f"; recorded with {software}" if " effect " in software else ""
             raise BadLog(f"{recording.path}: the scene in the log cannot be built: {reason}") from error
         except ValueError as error:
             raise BadLog(f"{recording.path}: the scene in the log cannot be built: {error}") from error
@@ -101,7 +103,8 @@ class Replay:
             if (job.object, job.step) in self._needed:
                 self._inline.submit(job)
         self._collect(recording.first)
-        if self.simulation.world.backend.build() != recording.scene.build and recording.scene.build:
+        self._same_effects()
+        if code.build_id(self.simulation) != recording.scene.build and recording.scene.build:
             self.compared.notes.append(
                 "another build than the recorded one (kernels, compiler, processor or GPU): last digits may differ"
             )
@@ -171,6 +174,14 @@ class Replay:
                 raise BadLog(
                     f"{self.recording.path}: the mesh of object {body.name!r} is not the recorded one "
                     f"({', '.join(other)}){f'; was {file} changed?' if file else ''}"
+                )
+
+    def _same_effects(self) -> None:
+        """Notes effects of other packages that are not the recorded ones."""
+        for other in code.codes(self.simulation):
+            if str(other) not in self.recording.scene.software:
+                self.compared.notes.append(
+                    f"{other} is not the code of the log: recorded with {self.recording.scene.software}"
                 )
 
     def _same_obstacles(self) -> None:

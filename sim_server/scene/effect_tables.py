@@ -7,6 +7,7 @@ from pydantic import BaseModel, ValidationError
 from pydantic_core import InitErrorDetails
 
 from sim_server import effects
+from sim_server.errors import InputError
 from sim_server.scene.parameters import complaint, nearest
 
 BELONGS = {
@@ -41,12 +42,14 @@ def checked_effects(scope: str, table: Any, context: Any = None) -> dict[str, Ba
 
 
 def _checked(scope: str, name: str, values: Any, context: Any) -> BaseModel | None:
-    known = effects.known_effects()
-    if name not in known:
-        raise _error("no such effect" + nearest(name, known, "effects"), values)
+    if not effects.exists(name):
+        raise _error("no such effect" + nearest(name, effects.all_effects(), "effects"), values)
     if values is False:
         return None
-    module = effects.effect(name)
+    try:
+        module = effects.effect(name)
+    except InputError as error:
+        raise _error(str(error), values) from error
     if scope != module.SCOPE:
         raise _error(f"effect {name!r} does not belong here; {BELONGS[module.SCOPE]}", values)
     if isinstance(values, module.Params):

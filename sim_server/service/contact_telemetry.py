@@ -45,7 +45,7 @@ class ContactTelemetry:
 
     def look(self) -> bool:
         """Returns True if somebody wants poses."""
-        return bool(self._simulation.reaction_names) and self._link.wants_pose()
+        return any(mover.listed for mover in self._simulation.movers) and self._link.wants_pose()
 
     def publish_poses(self, step: int, poses: Float64) -> None:
         """Sends the poses (obstacles, 7) after a step to subscribers."""

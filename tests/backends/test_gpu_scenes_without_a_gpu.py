@@ -14,13 +14,16 @@ from sim_server.backends.gpu.inverse.plan import plan
 from sim_server.backends.gpu.inverse.workspace import workspace
 from sim_server.backends.gpu.islands import OWN_SURFACES
 from sim_server.checkpoint.content import capture
+from sim_server.explain.explanation import explain
 from sim_server.simulation import Simulation
 from sim_server.state.arrays import state_arrays
+from sim_server.state.code import build_id
 from sim_server.state.start import Start
 from sim_server.updates.driver import Driver
 from tests.backends import fake_cupy
 from tests.contact.scenes import block, floor, over, ram
 from tests.holders.holder_scenes import held_bar, left, right
+from tests.own_effect.own_package import install, with_own_header
 from tests.resets.going_on import resumed
 from tests.resets.state_scenes import made
 from tests.scenes import bar, scene
@@ -386,3 +389,34 @@ def test_a_scene_with_holders_is_built(cupy, precision):
     engine.run(3)
     records, reactions = engine.records_and_reactions()
     assert records["step"].tolist() == [1, 2, 3] and reactions.shape == (3, 2, 6)
+
+
+def test_a_scene_on_a_gpu_is_explained(cupy):
+    """Each effect has the twins of its arrays: gravity the three numbers of g, in the precision of the kernels."""
+    found = explain("deploy/scenes/beam.toml", ["solver.precision=float32"], "gpu")
+    asked = {each.name: each for each in found.asked}
+    assert (asked["gravity"].bytes, asked["gravity"].device_bytes) == (24, 12)
+    assert asked["corotational"].device_bytes > 0 and found.device == "gpu"
+    assert asked["gravity"].kernels == {"effects/gravity.cu": ["gravity"]}
+    owners = {row.kernel: row.asker for row in found.launches}
+    assert owners["touch.apply"] == "touch" and owners["nodes.start"] == "core"
+
+
+def test_an_effect_of_another_package_is_put_together_with_the_others(cupy, tmp_path, monkeypatch):
+    """Its text, and the header beside it, compile in the kernel over nodes of the step."""
+    install(tmp_path)
+    with_own_header(tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)
+    sources = []
+    made = cupy.RawModule
+    monkeypatch.setattr(cupy, "RawModule", lambda **given: sources.append(given["code"]) or made(**given))
+    beside = "object.block.effects.trap={pull=2.0}"
+    (tmp_path / "scene.toml").write_text(
+        'dt = 0.02\n[[object]]\nname = "block"\nmesh = { bar = [2, 2, 2], size = [1, 1, 1] }\n'
+        "[object.effects]\ncorotational = { young = 1e5, poisson = 0.3 }\n"
+    )
+    simulation = Simulation.load(tmp_path / "scene.toml", [beside], "gpu")
+    simulation.engine.run(2)
+    assert "trap.pull" in [launch.name for launch in simulation.step_launches]
+    assert any("::pull_item(" in code and "::gather" in code and "trap_law.cuh" in code for code in sources)
+    assert len(build_id(simulation)) == 24

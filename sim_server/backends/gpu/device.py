@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from copy import copy
 from functools import cache
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -106,7 +107,7 @@ class DeviceModule(KernelText):
         self.gpu = gpu
         self._module = cupy().RawModule(
             code=self.text,
-            options=options(self.types),
+            options=(*options(self.types), *folder_options(self.folder)),
             backend="nvrtc",
             enable_cooperative_groups=cooperative,
         )
@@ -177,6 +178,14 @@ def own_headers() -> tuple[str, ...]:
 def options(types: dict[str, str]) -> tuple[str, ...]:
     """Returns the compiler options of a text. types: that `real` and `local` stand for."""
     return ("-std=c++17", f"-I{INCLUDE}", *(f"-D{name}={kind}" for name, kind in types.items()), headers_option())
+
+
+def folder_options(*folders: Path | None) -> tuple[str, ...]:
+    """Returns the compiler options for texts of other packages. folders: of texts, None for those of this package."""
+    found = sorted({folder for folder in folders if folder is not None})
+    headers = sorted(p for folder in found for p in folder.iterdir() if p.suffix in (".h", ".cuh"))
+    digest = hashlib.sha256(b"".join(p.read_bytes() for p in headers)).hexdigest()[:16]
+    return (*(f"-I{folder}" for folder in found), *((f"-DTEXTS_OUTSIDE=x{digest}",) if headers else ()))
 
 
 PRECISIONS = {
@@ -252,6 +261,8 @@ class Gpu:
         """Returns a digest of code, device and CUDA; runs of a scene with equal ones agree bit for bit."""
         runtime = self.cp.cuda.runtime.runtimeGetVersion()
         parts = [build_id(), digest(".cu", ".cuh", ".h"), self.properties["name"].decode(), str(runtime)]
+        outside = [module for module in self._modules.values() if module.folder is not None]
+        parts += sorted(module.text + " ".join(folder_options(module.folder)[1:]) for module in outside)
         return hashlib.sha256("\0".join(parts).encode()).hexdigest()[:24]
 
     def module(self, path: str) -> DeviceModule:

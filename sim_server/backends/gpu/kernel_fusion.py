@@ -19,7 +19,15 @@ from numpy.typing import NDArray
 
 from sim_server.backends.declarations import Declarations
 from sim_server.backends.gpu.cupy_types import KernelFunction
-from sim_server.backends.gpu.device import DeviceLaunch, compiled, cupy, options, own_headers, processors
+from sim_server.backends.gpu.device import (
+    DeviceLaunch,
+    compiled,
+    cupy,
+    folder_options,
+    options,
+    own_headers,
+    processors,
+)
 
 DOMAINS = ("cells", "patches", "elements", "corners", "nodes", "blocks")
 NUMBERS: dict[str, type[np.number[Any]]] = {"int": np.int32, "float": np.float32, "double": np.float64}
@@ -132,7 +140,8 @@ class FusedKernel:
         self._prologue_blocks = prologue.blocks if prologue else 0
         text = FusedSource(launches, self.shape, epilogue, private, guard, prologue, exact)
         self._arguments = (np.int32(self.items), *text.values, *(x.params for x in (epilogue, prologue) if x))
-        flags = (*options(launches[0].types), *own_headers())
+        folders = folder_options(*(launch.folder for launch in launches))
+        flags = (*options(launches[0].types), *own_headers(), *folders)
         self._module = cupy().RawModule(code=text.source, options=flags, backend="nvrtc")
         self._function = self.function("fused")
         self._has_epilogue = epilogue is not None

@@ -21,6 +21,7 @@ PAGES = (
     "verification",
     "accuracy",
     "hard_cases",
+    "effects",
     "scheduler",
     "scaling",
     "haptics",
