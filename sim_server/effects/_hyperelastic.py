@@ -173,7 +173,7 @@ class Tetrahedra(Effect):
         self._energy = np.zeros(m)
 
     def _gradients(self, scene: Scene) -> Float64:
-        """Returns gradients (9, m); 0 for elements that were removed, which so have one deformation, wherever they are."""
+        """Returns gradients (9, m); 0 for elements that were removed, whose deformation is so always the same."""
         return self.rest.gradients(scene).reshape(-1, 9).T * self.rest.present(scene)
 
     def values_in(self, scene: Scene, law: Law) -> list[Values]:
