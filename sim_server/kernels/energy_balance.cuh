@@ -17,12 +17,14 @@
 //     criterion.
 // Explicit substeps: kinetic > SLACK_OF_SUBSTEPS (largest budget so far) + floor, since the kinetic energy of a mode of angular
 // frequency w oscillates, up to 1 / (1 - (h w / 2)^2) of its energy, h the substep. What is not stable grows beyond any factor.
+// With loads (effects/_loads.py) the work of a step is that of the forces of its last evaluation. Its error adds up where a load gives
+// energy and takes it back in every beat, so that a part SLACK_OF_LOADS of all work, of either sign, counts as not known.
 // Its size is the longer of the diagonals of its boxes at rest and at the start.
 #pragma once
 #include "host_device.cuh"
 
 constexpr double SLACK_OF_ENERGY = 2, LONG = 4, SLOW = 1e-3;
-constexpr double SLACK_OF_SUBSTEPS = 10;
+constexpr double SLACK_OF_SUBSTEPS = 10, SLACK_OF_LOADS = 0.1;
 
 enum OnRunaway { FREEZE = 0, GO_ON = 1, UNWATCHED = 2 };
 enum BalancePhase { WELL = 0, AWAY = 1, FROZEN = 2 };  // AWAY: ran away in the last step, and goes on
@@ -42,6 +44,8 @@ struct Balance {      // of a body, after its last step [J]
     double limit;     // of stride [m]
     double slack;     // of explicit substeps: kinetic may be this times `largest`; 0: an implicit scheme
     double largest;   // budget so far, with slack
+    double driven;    // 1: the scene has loads, 0: none
+    double gross;     // sum of |work| of all steps, with loads
     double kinetic, elastic, gravity, work, budget;
     double fallen;    // work of gravity
     double stride;    // largest difference of two nodes' steps along an axis [m]
@@ -85,7 +89,7 @@ HOST_DEVICE void start_balance(Balance& b, const Sums& s, double size, double dt
     const double longest = size > b.diagonal ? size : b.diagonal;
     b.kinetic = inertia ? s.kinetic : 0;
     b.gravity = s.gravity;
-    b.work = b.fallen = b.largest = 0;
+    b.work = b.fallen = b.largest = b.gross = 0;
     b.start = b.budget = b.kinetic + b.elastic;
     b.floor = 0.5 * b.mass * square(SLOW * longest / dt);
     b.limit = LONG * longest + 2 * stride_of(s);
@@ -112,7 +116,8 @@ HOST_DEVICE bool update_balance(Balance& b, const Sums& s, int on_runaway, bool 
         b.largest = b.budget > b.largest ? b.budget : b.largest;
         allowed = b.slack * b.largest;
     }
-    const double most = allowed + b.floor;
+    const double gross = b.gross + b.driven * (s.work < 0 ? -s.work : s.work);
+    const double most = allowed + SLACK_OF_LOADS * gross + b.floor;
     const bool known = b.budget == b.budget;  // NaN: the law defines no energy of the state at the start
     const bool away = !is_finite(s.kinetic) || !is_finite(s.gravity) || (known && b.kinetic > most) || b.stride > b.limit;
     b.found = away && on_runaway != UNWATCHED;
@@ -120,5 +125,6 @@ HOST_DEVICE bool update_balance(Balance& b, const Sums& s, int on_runaway, bool 
     if (b.phase == FROZEN) return true;  // it goes back to where it was
     b.work = work;
     b.fallen = fallen;
+    b.gross = gross;
     return false;
 }

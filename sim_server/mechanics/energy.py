@@ -36,6 +36,7 @@ def collected_energies(
     balance = np.zeros(len(world.bodies), structs.BALANCE)
     for body, b in zip(world.bodies, balance, strict=True):
         b["mass"] = world.mass[body.nodes].sum()
+        b["driven"] = float("load" in arrays)
         b["slack"] = SLACK_OF_SUBSTEPS if world.explicit else 0
         b["diagonal"] = np.linalg.norm(np.ptp(world.rest[body.nodes], axis=0))
     return Energies(
