@@ -138,6 +138,7 @@ class Corotational(Effect):
             return np.stack([lam * volume * here, mu * volume * np.where(here > 0, 1.0, REMOVED)])
 
         self.lame = world.follow("corotational", *rest.of, compute=lame)
+        self.present = rest.followed(world, rest.present)
         owner = np.repeat([body.index for body, _ in listed], [len(body.mesh.tets) for body, _ in listed])
         self.owner = owner[order]
         m = len(self.elements)
@@ -175,7 +176,7 @@ class Corotational(Effect):
             "blocks", len(system.sums), accumulate=int(accumulate), start=stencil.pair_start, pairs=stencil.pairs,
             scaled_gradients=self.scaled_gradients, sums=system.sums, **twist,
         )  # fmt: skip
-        return [elements, gather, blocks]
+        return [elements, gather, *self._leave_out(system, stencil, self.quaternion), blocks]
 
     def force_launches(self, system: System, stencil: Stencil | None, frames: bool) -> list[Launch] | None:
         w = self.world
@@ -193,7 +194,18 @@ class Corotational(Effect):
             "gather_frames" if frames else "gather_impulses", w.nodes, start=stencil.corner_start,
             corners=stencil.corners, nodal_impulse=self.nodal_impulse, b=system.b, **rotations,
         )  # fmt: skip
-        return [forces, gather]
+        return [forces, gather, *(self._leave_out(system, stencil, self.near) if frames else [])]
+
+    def _leave_out(self, system: System, stencil: Stencil, quaternion: Float64) -> list[Launch]:
+        """Launches that leave removed elements out of the frames of nodes."""
+        w = self.world
+        if w.without_elements is None:
+            return []
+        leave_out: Launch = w.backend.module("effects/corotational_cut.cu").bind(
+            "leave_out", w.nodes, start=stencil.corner_start, corners=stencil.corners, present=self.present,
+            quaternion=quaternion, at_rest=w.without_elements, mean=system.mean,
+        )  # fmt: skip
+        return [leave_out]
 
     @property
     def rotation(self) -> Float64:

@@ -92,6 +92,7 @@ class Cutting(Effect):
         self.touchable = world.touchable = np.zeros(n)
         world.backend.keep(self.touchable)
         self._before, self.at_rest, self.changed_at = self.left.copy(), np.zeros(n), np.full(n, -1.0)
+        world.without_elements = self.at_rest
         world.backend.keep(self._before, self.at_rest)
         world.backend.keep(self.changed_at, exact=True)
 

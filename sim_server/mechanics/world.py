@@ -89,6 +89,7 @@ class World:
     uncut_mass (n,): with all elements, where some may be removed [kg];
     free (n,): 1, or 0 at fixed nodes; held (n,): 1 at nodes of holders, which are fixed, too; held_nodes (held,): these
     nodes in the order of the launches over them; held_moves (bodies,): 1 where a holder moves in a step by stages;
+    without_elements (n,): 1 at free nodes whose elements were all removed; None: none can be
     touchable (n,): 1 at nodes that may touch obstacles, where that changes as objects are cut; None: as `free`
     rollers: nodes that may move along some directions only, None without any; alpha, beta (bodies,):
     Rayleigh damping of the mass [1/s] and of the stiffness [s] at the start; damping: both by the
@@ -151,6 +152,7 @@ class World:
         self.free, self.held = np.ones(first), np.zeros(first, np.int32)
         self.held_nodes, self.held_moves = np.zeros(0, np.int32), np.zeros(len(self.bodies), np.int32)
         self.touchable: Float64 | None = None
+        self.without_elements: Float64 | None = None
         self.rollers: Rollers | None = None
         self.load, self.loading = np.zeros((0, 3)), list[AddsLoad]()
         self.alpha, self.beta = np.zeros(len(self.bodies)), np.zeros(len(self.bodies))

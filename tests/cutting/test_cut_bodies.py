@@ -41,6 +41,8 @@ def test_what_is_left_moves_as_a_body_without_these_elements(law, tmp_path):
     other.engine.run(20)
     np.testing.assert_allclose(sim.fetch().x[kept], other.fetch().x, atol=2e-8)
     np.testing.assert_allclose(sim.fetch().mass[kept], other.world.mass, rtol=1e-12)
+    if law == "corotational":  # frames of others are of all neighbours at rest
+        np.testing.assert_allclose(sim.system.rotation[kept], other.system.rotation, atol=1e-6)
     assert np.abs(other.world.x - made(law).world.x[kept]).max() > 0.05, "it moves"
 
 
