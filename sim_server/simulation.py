@@ -85,6 +85,7 @@ class Simulation:
         self.ties = self.contact.contact_input().ties if self.contact else make_ties(self.world)
         if self.holders and self.touch:
             self.holders.use_load(self.touch.force)
+        self.fixed = self.world.free == 0  # at the start, when the pattern of A is made; later nodes may come to rest
         elements = [e.elements for e in self.effects.values() if e.elements is not None]
         self.system = System(self.world, [e.coupled for e in self.effects.values() if e.coupled is not None])
         matched = self._matched()

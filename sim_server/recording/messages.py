@@ -56,7 +56,7 @@ def topology(simulation: Simulation, body: Body) -> pb.Topology:
     """Converts mesh and block pattern of one object, epoch 1."""
     pose = simulation.scene.objects[body.index].pose
     row_start, columns = simulation.system.body_pattern(body.first, body.last)
-    fixed = np.flatnonzero(simulation.world.free[body.nodes] == 0)
+    fixed = np.flatnonzero(simulation.fixed[body.nodes])
     message = pb.Topology(
         header=pb.Header(object=body.name, epoch=1),
         nodes=body.last - body.first,

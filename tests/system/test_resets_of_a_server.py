@@ -53,13 +53,18 @@ def test_resets_are_seen_and_replay_to_the_bit(tmp_path: Path) -> None:
     assert [(r.header.object, r.step) for r in found] == [("beam", running.step), ("", paused.step), ("", paused.step)]
 
 
-def test_a_saved_run_goes_on_and_its_log_replays_to_the_bit(tmp_path: Path) -> None:
-    """A factor is in use and a grab held when it is saved, and both are when it goes on."""
+@pytest.mark.parametrize("cut", [False, True])
+def test_a_saved_run_goes_on_and_its_log_replays_to_the_bit(tmp_path: Path, cut: bool) -> None:
+    """A factor is in use and a grab held when it is saved, and both are when it goes on; also where nodes have come to
+    rest, as they have no elements any more."""
     stage, log, file = Stage(tmp_path), tmp_path / "run.mcap", tmp_path / "beam.npz"
     scene = beam(tmp_path, (2, 2, 6), 'update = "every-7"')
+    scene.write_text(scene.read_text() + f"cutting = {str(cut).lower()}\n")
     try:
         server = stage.server(scene)
         with stage.client() as client:
+            if cut:
+                assert client.cut("beam", where="Z > 3.4 and X > 0.5").removed
             client.grab("beam", at="tip", target=(0.9, 0.5, 4), stiffness=1e5, max_force=9000)
             until(lambda: fresh(client).step > 10, "it is pulled")
             client.pause()
