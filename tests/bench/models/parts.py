@@ -38,16 +38,24 @@ BESIDE = {
 }  # what an effect is listed beside, and measured with
 PARTS = ("elements", "sums", "rest")
 OTHERS = {
+    "buoyancy",
+    "cable",
     "cavity",
     "contact",
+    "cutting",
+    "damage",
     "fixed",
     "gravity",
+    "growth",
     "muscle",
+    "plasticity",
+    "prony",
     "rayleigh",
     "target",
     "touch",
     "traction",
-}  # effects that are no models
+    "wind",
+}  # fmt: skip; effects that are no models, or stand beside one (bench effects)
 STRETCH, CURVATURE, NOISE = 1.05, 0.15, 0.01  # -, 1/m, of an edge
 
 Reals = NDArray[np.float64]
