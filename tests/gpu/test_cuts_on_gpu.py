@@ -1,0 +1,79 @@
+# SPDX-License-Identifier: MIT
+"""Bodies that lose elements, beside the CPU's. Runs where there is a GPU: -m gpu."""
+
+import numpy as np
+import pytest
+
+from protocol import messages_pb2 as pb
+from sim_server.errors import InputError
+from sim_server.scene.model import Scene
+from sim_server.simulation import Simulation
+from sim_server.state.start import Start
+from sim_server.updates.driver import Driver
+from tests.cutting.cut_scenes import HALVED, LAWS, cut, table
+
+pytestmark = pytest.mark.gpu
+NOTCH = "abs(X - 1) < 0.13 and Y > 0.25"
+
+
+def made(law: str, device: str, **keys) -> Simulation:
+    return Simulation(Scene.model_validate(table(law, **keys), context={"folder": "."}), device)
+
+
+@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize("where", [NOTCH, HALVED])
+def test_what_is_left_moves_as_on_a_cpu(law, where):
+    ends = []
+    for device in ("gpu", "cpu"):
+        sim = made(law, device)
+        sim.engine.run(3)
+        cut(sim, where)
+        sim.engine.run(12)
+        ends.append(sim.fetch().x.copy())
+        assert (sim.engine.records()["status"] == pb.CONVERGED).all()
+    np.testing.assert_allclose(ends[0], ends[1], atol=1e-6)
+
+
+@pytest.mark.parametrize("scheme", ["newmark", "bdf2", "generalized_alpha", "central_difference"])
+def test_other_schemes_go_on_as_on_a_cpu(scheme):
+    solver = {"preconditioner": "none"} if scheme == "central_difference" else {"tolerance": 1e-10}
+    ends = []
+    for device in ("gpu", "cpu"):
+        sim = made("corotational", device, integrator={"scheme": scheme}, solver=solver)
+        cut(sim, NOTCH)
+        sim.engine.run(12)
+        ends.append(sim.fetch().x.copy())
+    np.testing.assert_allclose(ends[0], ends[1], atol=1e-5)
+
+
+@pytest.mark.parametrize("precision", ["float64", "mixed", "float32"])
+def test_solves_go_on_with_a_factor_from_before(precision):
+    """It takes more iterations; what it comes to is the same."""
+    solver = {"update": "lockstep-6", "tolerance": 1e-5 if precision == "float32" else 1e-8, "precision": precision,
+              "preconditioner": "cholesky", "max_iterations": 3000}  # fmt: skip
+    sim = made("corotational", "gpu", solver=solver)
+    driver = Driver(sim)
+    driver.advance(14)
+    cut(sim, HALVED)
+    assert (driver.advance(20)["status"] == pb.CONVERGED).all()
+    gone = np.flatnonzero(sim.world.backend.fetch(sim.cutting.at_rest) > 0)
+    x = sim.fetch().x[gone].copy()
+    driver.advance(5)
+    np.testing.assert_allclose(sim.fetch().x[gone], x, atol=1e-5)
+
+
+def test_a_reset_makes_whole():
+    sim = made("corotational", "gpu")
+    start = Start(sim)
+    sim.engine.run(10)
+    first = sim.fetch().x.copy()
+    cut(sim, HALVED)
+    sim.engine.run(10)
+    start.reset()
+    sim.engine.run(10)
+    np.testing.assert_array_equal(sim.fetch().x, first)
+
+
+def test_steps_by_the_factor_alone_are_refused():
+    with pytest.raises(InputError, match="ros2"):
+        made("corotational", "gpu", integrator={"scheme": "ros2"})
