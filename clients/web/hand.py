@@ -137,6 +137,17 @@ def push(
         client.send("push", wanted, lambda reply: refused(reply.error) if reply is not None and reply.error else None)
 
 
+def swept(start: Sequence[float], end: Sequence[float], eye: NDArray, size: float) -> list[tuple[float, float, float]]:
+    """Returns the corners of what a blade sweeps that is drawn from start to end and held along the line of sight [m].
+
+    eye (3,): of who draws; size: how far it reaches before and behind the line that is drawn
+    """
+    a, b = np.asarray(start, float), np.asarray(end, float)
+    sight = (a + b) / 2 - eye
+    reach = sight / (float(np.linalg.norm(sight)) or 1.0) * size
+    return [(float(x), float(y), float(z)) for x, y, z in (a - reach, b - reach, b + reach, a + reach)]
+
+
 def vector(values: Sequence[float] | NDArray) -> pb.Vector:
     x, y, z = (float(value) for value in values)
     return pb.Vector(x=x, y=y, z=z)

@@ -18,7 +18,7 @@ import numpy as np
 
 from clients.client import Client
 from clients.errors import BadInput, ClientError
-from clients.web.hand import Hand, push
+from clients.web.hand import Hand, push, swept
 from clients.web.paint import MODES, Paint
 from clients.web.surfaces import Surfaces
 
@@ -205,6 +205,7 @@ class Tab:
             )  # fmt: skip
             node.on_drag("left")(self._grab)
             node.on_drag("left", modifier="shift")(self._push)
+            node.on_drag("left", modifier="cmd/ctrl")(self._cut)
             self._nodes.append(node)
 
     # --- pointer ----------------------------------------------------------------------------------------------------
@@ -255,6 +256,17 @@ class Tab:
             force *= min(1.0, grip.limit / size) if size else 0.0
             radius = self._radius.value / 100 * grip.size
             push(client, name, surfaces.points[vertex], force, radius, lambda why: self.tell(f"{name}: {why}"))
+
+    async def _cut(self, event: viser.SceneNodeDragEvent) -> None:
+        surfaces = self.page.surfaces
+        if event.phase != "end" or surfaces is None or not len(surfaces.points):
+            return
+        name, _ = surfaces.nearest(np.asarray(event.start_position))
+        grip = self.page.grips.get(name)
+        if grip is not None:
+            eye = np.asarray(self.viewer.camera.position)
+            blade = swept(event.start_position, event.end_position, eye, grip.size)
+            self.ask(lambda client: client.cut(name, blade=blade))
 
     def hands_off(self) -> None:
         """Lets go of everything."""

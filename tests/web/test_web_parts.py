@@ -20,7 +20,7 @@ from clients.errors import ClientError
 from clients.log.frames import Mesh, Skin
 from clients.web.decimate import decimated
 from clients.web.feed import Feed
-from clients.web.hand import Hand, described_objects, grip
+from clients.web.hand import Hand, described_objects, grip, swept
 from clients.web.paint import BANDS, Paint, split
 from clients.web.panel.curves import POINTS, History
 from clients.web.panel.sliders import Slider, Sliders, named, value_of
@@ -466,3 +466,8 @@ def test_sliders_are_made_anew_for_other_bounds_and_other_kinds_of_values() -> N
         counts.append(gui.add_slider.call_count)
     assert counts == [1, 1, 2, 3]
     assert gui.add_slider.call_args_list[1].args[2] == 7.0
+
+
+def test_a_blade_is_held_along_the_line_of_sight() -> None:
+    corners = np.array(swept((0, 0, 0), (1, 0, 0), np.array([0.5, 0, 5.0]), 2.0))
+    np.testing.assert_allclose(corners, [[0, 0, 2], [1, 0, 2], [1, 0, -2], [0, 0, -2]])
