@@ -22,6 +22,7 @@ from protocol import messages_pb2 as pb
 
 STATUS_PERIOD = 0.5  # s between two questions for status and parameters
 LOST_AFTER = 2  # questions without an answer
+MESH_PERIOD = 0.3  # s between two questions for meshes of a body that is being cut
 RETRY_PERIOD = 0.5  # s between two attempts to connect
 QUESTION_TIMEOUT = 2.0  # s
 RENEWED_AFTER = 1.5  # s after a change of parameters; a server renews moduli each second
@@ -52,7 +53,7 @@ class Link:
         self.parameters: list[pb.LiveParameter] = []
         self._new_meshes: dict[str, Mesh] | None = None  # with moduli that were set
         self._elastic: dict[str, str] | None = None  # values of the effects of objects
-        self._cut = False  # frames are of another mesh
+        self._cut, self._meshes_due = False, 0.0  # frames are of another mesh; when it may be asked for
         self._renew_at: float | None = None  # when the meshes are to be asked for again
         self.lost = ""  # why the connection is over; empty: it is not
         self._stop, self._asked = threading.Event(), threading.Event()
@@ -120,7 +121,8 @@ class Link:
 
     def _ask_meshes(self) -> None:
         """Gets the meshes again after a cut."""
-        if self._cut:
+        if self._cut and time.monotonic() >= self._meshes_due:
+            self._meshes_due = time.monotonic() + MESH_PERIOD
             with contextlib.suppress(ClientError):  # a late answer: the next frame has it asked for again
                 found = self.client.meshes()
                 if found.keys() == self.meshes.keys():

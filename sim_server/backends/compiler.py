@@ -90,6 +90,8 @@ def read_text(path: str) -> tuple[str, str]:
         return Path(law).stem, text.replace("#include LAW\n", (SOURCES / law).read_text())
     except OSError as error:
         raise CompileError(f"kernel text {path}: {error.strerror}") from error
+    except UnicodeDecodeError as error:
+        raise CompileError(f"kernel text {path}: is no UTF-8 text") from error
 
 
 def _parts(path: str) -> tuple[str, str]:

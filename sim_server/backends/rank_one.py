@@ -13,6 +13,7 @@ class RankOne:
     first: (bodies + 1,) the first one of each body
     start: (parts + 1,) into the nodes
     node: (k,) of the scene
+    free: (nodes of the scene,) 0 at fixed nodes, whose rows of A are the identity: u is 0 there
     slope: (k, 3) u there, world frame; launches make it
     scale: (parts, 4) at 2: factor of u u^T [kg over the square of u], at least 0; launches make it
     """
@@ -22,3 +23,4 @@ class RankOne:
     node: Int32
     slope: Float64
     scale: Float64
+    free: Float64

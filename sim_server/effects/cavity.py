@@ -44,7 +44,7 @@ from sim_server.arrays import Float64, Int32
 from sim_server.backends.base import Launch
 from sim_server.backends.energies import ElementEnergies
 from sim_server.backends.rank_one import RankOne
-from sim_server.effects._base import params_in
+from sim_server.effects._base import Effect, params_in
 from sim_server.effects._loads import LoadingEffect
 from sim_server.errors import InputError
 from sim_server.mechanics.system import Stencil, System
@@ -321,12 +321,21 @@ class Cavities(LoadingEffect):
         )  # fmt: skip
         return [*([lids] if len(self.centre) else []), walls, chunks, slopes, pressures, load]
 
+    def join(self, others: Sequence[Effect]) -> None:
+        """Raises InputError for walls that slide, whose part of A of rank one would have to be taken to directions."""
+        rollers = self.world.rollers
+        if self.changes_with_volume and rollers is not None and rollers.limited[self.node].any():
+            raise InputError(
+                f"object {self._bodies[0].name!r}: cavity with amount or volume cannot have nodes on its wall that are "
+                "fixed along some directions only"
+            )
+
     def rank_one(self) -> RankOne | None:
         if not self.changes_with_volume or self.world.explicit:
             return None
         owner = [wall.body.index for wall in self.walls]
         first = np.searchsorted(owner, np.arange(len(self.world.bodies) + 1)).astype(np.int32)
-        return RankOne(first, self.node_start, self.node, self.slope, self.state)
+        return RankOne(first, self.node_start, self.node, self.slope, self.state, self.world.free)
 
     def energies(self) -> ElementEnergies | None:
         """Of gases and liquids [J]."""

@@ -25,7 +25,7 @@ Source: Cotin, Delingette and Ayache, A hybrid elastic model for real-time cutti
 2000 (removal); Smith, Bjorstad and Gropp, Domain Decomposition, 1996, section 1.3 (Schwarz).
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Annotated, Any
 
 import numpy as np
@@ -35,7 +35,7 @@ from sim_server.arrays import Float64
 from sim_server.backends.base import CutInput, Launch
 from sim_server.effects._base import Effect
 from sim_server.errors import InputError
-from sim_server.mechanics.removal import masses_left, numbers_of, present, present_nodes
+from sim_server.mechanics.removal import masses_left, present, present_nodes, ranges_of
 from sim_server.mechanics.system import Stencil, System
 from sim_server.mechanics.world import Body, World
 from sim_server.mesh.faces import Faces
@@ -48,7 +48,7 @@ SCOPE = "object"
 
 def _numbers(text: str) -> str:
     try:
-        numbers_of(text)
+        ranges_of(text)
     except ValueError as error:
         raise complaint(str(error)) from None
     return text
@@ -89,7 +89,7 @@ class Cutting(Effect):
         self.left = world.follow("cutting", compute=lambda scene: present_nodes(scene, world))
         self._faces = {body.index: Faces.of(body.mesh.tets) for body in self.bodies}
         self.surface = world.follow("cutting", compute=self._on_surface)
-        self.touchable = world.touchable = np.zeros(n)
+        self.touchable = world.touchable = np.ones(n)
         world.backend.keep(self.touchable)
         self._before, self.at_rest, self.changed_at = self.left.copy(), np.zeros(n), np.full(n, -1.0)
         world.without_elements = self.at_rest
@@ -120,6 +120,10 @@ class Cutting(Effect):
                 self.bodies[0],
                 "objects that are cut touch obstacles alone: contact = { between = false }, self = false",
             )
+
+    def join(self, others: Sequence[Effect]) -> None:
+        """Says what may be touched before the first step, once all that is fixed is known."""
+        self.touchable[:] = self.world.free * self.surface
 
     def _refusal(self, body: Body, why: str) -> InputError:
         return InputError(f"object {body.name!r}, effect cutting: {why}")

@@ -102,7 +102,7 @@ class Damage(TetrahedraWithHistory):
     def join(self, others: Sequence[Effect]) -> None:
         super().join(others)
         self.lame = self.world.follow("corotational", compute=lambda scene: self.elasticity(scene)[0])
-        self.limits = self.world.follow("damage", "corotational", compute=self._limits)
+        self.limits = self.world.follow("damage", "corotational", "growth", compute=self._limits)
 
     def _limits(self, scene: Scene) -> Float64:
         lam, mu = self.elasticity(scene)

@@ -42,6 +42,7 @@ from sim_server.scene.parameters import Vector
 
 SCOPE = "object"
 LEAST = 0.05  # stretch of a rest shape
+MOST = 100  # likewise, the largest
 
 
 def _three(value: Any) -> Any:
@@ -78,9 +79,10 @@ def _stretches(body: Body, scene: Scene) -> Float64:
         return np.ones((len(body.mesh.tets), 3))
     values = constants_of(LAW, body, params)
     stretches = 1 + values["expansion"] * values["amount"][:, None]
-    if not (stretches >= LEAST).all():
+    if not ((stretches >= LEAST) & (stretches <= MOST)).all():
+        wrong = stretches.min() if stretches.min() < LEAST else stretches.max()
         raise InputError(
-            f"object {body.name!r}, effect growth: 1 + expansion amount is {stretches.min():g}: must be {LEAST} or more"
+            f"object {body.name!r}, effect growth: 1 + expansion amount is {wrong:g}: must be from {LEAST} to {MOST}"
         )
     return stretches
 

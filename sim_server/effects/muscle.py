@@ -59,11 +59,19 @@ ALONE = {  # beside these alone it would have no shape
 
 
 def _not_zero(direction: tuple[float, float, float]) -> tuple[float, float, float]:
-    if not any(direction):
-        raise complaint("a direction must not be zero")
+    size = max(map(abs, direction))
+    if not 1e-100 < size < 1e100:
+        raise complaint("a direction must not be zero, nor of a length that is out of bounds (1e-100 to 1e100)")
     return direction
 
 
+def _beat(period: float) -> float:
+    if period != 0 and not period >= SHORTEST:
+        raise complaint(f"must be 0, or at least {SHORTEST:g} s")
+    return period
+
+
+SHORTEST = 1e-6  # s
 TEXT = "effects/muscle.cu"
 ONE = Live(0, 1)
 PACKED = ("stress", "activation", "period", "phase", "duty", "optimum", "width")  # as the kernel text has them
@@ -75,7 +83,9 @@ LAW = Law(
         ),
         Constant("direction", Annotated[Vector, AfterValidator(_not_zero)], "of the fibres at rest", live=Live()),
         Constant("activation", Annotated[float, Field(ge=0, le=1)], "of the fibres [-]", 1.0, live=ONE),
-        Constant("period", NotNegative, "of beats [s]; 0: none", 0.0, live=Live(0, 3)),
+        Constant(
+            "period", Annotated[NotNegative, AfterValidator(_beat)], "of beats [s]; 0: none", 0.0, live=Live(0, 3)
+        ),
         Constant("phase", float, "by which beats are late, in periods [-]", 0.0, live=ONE),
         Constant("duty", Annotated[float, Field(gt=0, le=1)], "part of the period [-]", 0.5, live=Live(0.05, 1)),
         Constant("optimum", Annotated[float, Field(gt=0)], "stretch of most force [-]", 1.0, live=Live(0.5, 1.5)),

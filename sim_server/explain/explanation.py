@@ -168,6 +168,7 @@ def _launches(simulation: NotedSimulation) -> Iterator[LaunchRow]:
     lists: dict[str, Sequence[Launch]] = {"before the solve": given.assemble, "after the solve": given.integrate}
     if simulation.scene.integrator.explicit:
         lists = {}  # a step is made of its substeps
+    lists = {"before the step": given.history} | lists
     lists |= {when: part.launches for when, part in parts.items() if part is not None}
     lists |= {"before the first step": simulation.engine.begin, "energy": [e.launch for e in given.energies.elastic]}
     seen: set[int] = set()

@@ -18,13 +18,14 @@
 // Explicit substeps: kinetic > SLACK_OF_SUBSTEPS (largest budget so far) + floor, since the kinetic energy of a mode of angular
 // frequency w oscillates, up to 1 / (1 - (h w / 2)^2) of its energy, h the substep. What is not stable grows beyond any factor.
 // With loads (effects/_loads.py) the work of a step is that of the forces of its last evaluation. Its error adds up where a load gives
-// energy and takes it back in every beat, so that a part SLACK_OF_LOADS of all work, of either sign, counts as not known.
+// energy and takes it back in every beat, so that a part SLACK_OF_LOADS of all work, of either sign, counts as not known:
+// of the last thousand steps or so, so that a long run is watched as a short one.
 // Its size is the longer of the diagonals of its boxes at rest and at the start.
 #pragma once
 #include "host_device.cuh"
 
 constexpr double SLACK_OF_ENERGY = 2, LONG = 4, SLOW = 1e-3;
-constexpr double SLACK_OF_SUBSTEPS = 10, SLACK_OF_LOADS = 0.1;
+constexpr double SLACK_OF_SUBSTEPS = 10, SLACK_OF_LOADS = 0.1, FADING = 0.999;
 
 enum OnRunaway { FREEZE = 0, GO_ON = 1, UNWATCHED = 2 };
 enum BalancePhase { WELL = 0, AWAY = 1, FROZEN = 2 };  // AWAY: ran away in the last step, and goes on
@@ -45,7 +46,7 @@ struct Balance {      // of a body, after its last step [J]
     double slack;     // of explicit substeps: kinetic may be this times `largest`; 0: an implicit scheme
     double largest;   // budget so far, with slack
     double driven;    // 1: the scene has loads, 0: none
-    double gross;     // sum of |work| of all steps, with loads
+    double gross;     // sum of |work| of the steps, with loads, fading by FADING a step
     double kinetic, elastic, gravity, work, budget;
     double fallen;    // work of gravity
     double stride;    // largest difference of two nodes' steps along an axis [m]
@@ -107,7 +108,7 @@ HOST_DEVICE bool update_balance(Balance& b, const Sums& s, int on_runaway, bool 
     b.gravity = s.gravity;
     b.stride = stride_of(s);
     b.found = 0;
-    const double work = b.work + s.work, fallen = b.fallen + s.fallen;
+    const double given = is_finite(s.work) ? s.work : 0, work = b.work + given, fallen = b.fallen + s.fallen;
     b.budget = b.start + b.work + b.fallen;
     if (b.phase == FROZEN) return false;
     b.budget = b.start + work + fallen;
@@ -116,7 +117,7 @@ HOST_DEVICE bool update_balance(Balance& b, const Sums& s, int on_runaway, bool 
         b.largest = b.budget > b.largest ? b.budget : b.largest;
         allowed = b.slack * b.largest;
     }
-    const double gross = b.gross + b.driven * (s.work < 0 ? -s.work : s.work);
+    const double gross = FADING * b.gross + b.driven * (given < 0 ? -given : given);
     const double most = allowed + SLACK_OF_LOADS * gross + b.floor;
     const bool known = b.budget == b.budget;  // NaN: the law defines no energy of the state at the start
     const bool away = !is_finite(s.kinetic) || !is_finite(s.gravity) || (known && b.kinetic > most) || b.stride > b.limit;

@@ -27,8 +27,7 @@ def met_by_blade(x: Float64, tets: Int32, corners: Float64) -> Int64:
 
 def in_sphere(x: Float64, tets: Int32, center: Float64, radius: float) -> Int64:
     """Returns the numbers of the elements whose centroids are within `radius` of `center` [m]."""
-    away = x[tets].mean(axis=1) - center
-    return np.flatnonzero((away**2).sum(axis=1) <= radius**2)
+    return np.flatnonzero(np.linalg.norm(x[tets].mean(axis=1) - center, axis=1) <= radius)
 
 
 def torn(x: Float64, tets: Int32, gradients: Float64, present: Bools, limit: float) -> Int64:
@@ -39,7 +38,9 @@ def torn(x: Float64, tets: Int32, gradients: Float64, present: Bools, limit: flo
     """
     corners = x[tets]
     F = np.einsum("eai,eaj->eij", corners[:, 1:] - corners[:, :1], gradients)
-    above = np.flatnonzero(present & ((F**2).sum(axis=(1, 2)) > limit**2))  # the sum is that of all three
+    with np.errstate(over="ignore", invalid="ignore"):
+        square = (F**2).sum(axis=(1, 2))  # of all three stretches
+    above = np.flatnonzero(present & (square > limit * limit) & (square < np.inf))
     stretch = np.linalg.eigvalsh(F[above].swapaxes(1, 2) @ F[above])[:, 2] ** 0.5
     order = np.argsort(-stretch, kind="stable")
     taken, found = np.zeros(len(x), bool), []

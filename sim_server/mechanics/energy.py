@@ -18,6 +18,8 @@ SLACK_OF_SUBSTEPS: float = structs.LOOP.constant("SLACK_OF_SUBSTEPS")
 class EnergyContributor(Protocol):
     """An effect, as far as it takes part in the energy balance."""
 
+    name: str
+
     def balance_arrays(self) -> dict[str, Float64]:
         """Arrays of it that the balance reads, by name."""
 
@@ -34,9 +36,10 @@ def collected_energies(
     gravity = arrays.pop("gravity", np.zeros(3))
     world.backend.keep(gravity)
     balance = np.zeros(len(world.bodies), structs.BALANCE)
+    driving = {effect.name for effect in effects.values() if "load" in effect.balance_arrays()} - {"traction"}
     for body, b in zip(world.bodies, balance, strict=True):
         b["mass"] = world.mass[body.nodes].sum()
-        b["driven"] = float("load" in arrays)
+        b["driven"] = float(bool(driving & body.effects.keys()))
         b["slack"] = SLACK_OF_SUBSTEPS if world.explicit else 0
         b["diagonal"] = np.linalg.norm(np.ptp(world.rest[body.nodes], axis=0))
     return Energies(

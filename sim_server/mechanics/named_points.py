@@ -29,14 +29,23 @@ class NamedPoints:
         self.body = body
         self._world = world
         self._x: Float64 = np.zeros((0, 3))
-        self.free: NDArray[np.bool_] = world.free[body.nodes] > 0
+        self._moves = (world.free[body.nodes] > 0) | self._without_elements()
+        self.free: NDArray[np.bool_] = self._moves & ~self._without_elements()
         self.size = float(np.linalg.norm(np.ptp(body.mesh.rest, axis=0)))  # m, diagonal of the box at rest
 
     def now(self, x: Float64 | None = None) -> Float64:
         """Copies and returns positions of its nodes [m], (nodes, 3). x: of all nodes of the scene; None: fetch them."""
         fetched = self._world.backend.fetch(self._world.x) if x is None else x
         self._x = fetched[self.body.nodes].copy()
+        self.free = self._moves & ~self._without_elements()
         return self._x
+
+    def _without_elements(self) -> NDArray[np.bool_]:
+        """Returns which of its nodes rest since all their elements were removed."""
+        w, nodes = self._world, self.body.nodes
+        if w.without_elements is None:
+            return np.zeros(self.body.last - self.body.first, bool)
+        return np.asarray(w.backend.fetch(w.without_elements)[nodes] > 0)
 
     def box(self) -> tuple[Point, Point]:
         """Returns the lowest and highest coordinates [m]."""

@@ -16,24 +16,33 @@ NUMBERS = re.compile(r"\s*(\d{1,9})(?:-(\d{1,9}))?(?:\s+|$)")
 LEAST_MASS = 1e-6  # of its own, which a node without elements keeps, since equations divide by it
 
 
-def numbers_of(text: str) -> Int64:
-    """Returns the numbers of a text such as "3 7-9 12", ascending and once each. Raises ValueError."""
-    return _numbers_of(text).copy()
-
-
-@lru_cache(maxsize=64)
-def _numbers_of(text: str) -> Int64:
+def ranges_of(text: str) -> list[tuple[int, int]]:
+    """Returns first and last number of each part of a text such as "3 7-9 12". Raises ValueError."""
     at, ranges = 0, []
     while at < len(text):
         found = NUMBERS.match(text, at)
         if found is None:
             raise ValueError(f'{text[at : at + 20]!r} is no list of element numbers and ranges such as "3 7-9 12"')
         first, last = int(found[1]), int(found[2] or found[1])
-        if last < first or last - first > 10_000_000:
+        if last < first:
             raise ValueError(f"{found[0].strip()!r} is no range of element numbers, from a lower to a higher one")
-        ranges.append(np.arange(first, last + 1))
+        ranges.append((first, last))
         at = found.end()
-    return np.unique(np.concatenate([np.zeros(0, np.int64), *ranges]))
+    return ranges
+
+
+@lru_cache(maxsize=8)
+def numbers_of(text: str, count: int) -> Int64:
+    """Returns the numbers of such a text, ascending, once each, not to be changed. Raises ValueError.
+
+    count: of the elements that there are, from 0
+    """
+    ranges, named = ranges_of(text), np.zeros(count, bool)
+    if ranges and (last := max(last for _, last in ranges)) >= count:
+        raise ValueError(f"there is no element {last}: numbers are from 0 to {count - 1}")
+    for first, last in ranges:
+        named[first : last + 1] = True
+    return np.flatnonzero(named)
 
 
 def text_of(numbers: Sequence[int] | Int64) -> str:
@@ -52,12 +61,10 @@ def removed_from(scene: Scene, body: Body) -> Int64:
     params = scene.objects[body.index].effects.get("cutting")
     if params is None:
         return np.zeros(0, np.int64)
-    removed = _numbers_of(params.removed)  # type: ignore[attr-defined]
-    if len(removed) and removed[-1] >= len(body.mesh.tets):
-        raise InputError(
-            f"object {body.name!r}, effect cutting: removed has element {removed[-1]}; it has {len(body.mesh.tets)}"
-        )
-    return removed
+    try:
+        return numbers_of(params.removed, len(body.mesh.tets))  # type: ignore[attr-defined]
+    except ValueError as error:
+        raise InputError(f"object {body.name!r}, effect cutting: removed: {error}") from None
 
 
 def present(scene: Scene, bodies: Sequence[Body]) -> Float64:

@@ -88,7 +88,8 @@ class RosenbrockIntegrator(Integrator):
         self.first, self.estimate, self.known = np.zeros_like(w.v), np.zeros(w.nodes), np.zeros((w.nodes, 6))
         self.bound = np.array([self._bound(b) for b in w.bodies])
         limited = np.zeros(w.nodes, np.int32) if w.rollers is None else w.rollers.limited
-        self.unheld = np.array([(w.free[b.nodes] > limited[b.nodes]).all() for b in w.bodies], np.int32)
+        whole = [(w.free[b.nodes] > limited[b.nodes]).all() and "cutting" not in b.effects for b in w.bodies]
+        self.unheld = np.array(whole, np.int32)  # one that may come apart has no momenta of one rigid body
         self.factor_alone = scene.uses_factor_alone
         w.backend.keep(self.share, self.weight, self.first, self.estimate, self.known)
 

@@ -136,6 +136,8 @@ class Commands:
         if not 0 < len(command.parameters) <= MOST_SET:
             raise BadCommand(f"{len(command.parameters)} parameters; allowed: 1 to {MOST_SET} at a time")
         for p in command.parameters:
+            if p.key.endswith("cutting.removed"):
+                raise BadCommand(f"{p.key[:80]}: elements are removed by the command cut, and come back by reset")
             if len(p.key) > LONGEST_KEY or len(p.value) > LONGEST_VALUE:
                 raise BadCommand(
                     f"{p.key[:40]}...: at most {LONGEST_KEY} characters of a key, {LONGEST_VALUE} of a value"

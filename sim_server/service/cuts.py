@@ -2,7 +2,6 @@
 """Cuts of clients: finds the elements, removes them by a parameter of the effect, tells viewers of new surfaces."""
 
 import json
-import math
 from collections import deque
 from functools import partial
 
@@ -15,6 +14,7 @@ from sim_server.mechanics.cut_shapes import in_sphere, met_by_blade
 from sim_server.mechanics.removal import numbers_of, removed_from, text_of
 from sim_server.mechanics.world import Body
 from sim_server.mesh.faces import Faces
+from sim_server.mesh.skin import Skin
 from sim_server.network.link import ServerLink
 from sim_server.parameters import ParameterUpdate
 from sim_server.recording.recorder import Recorder
@@ -23,6 +23,7 @@ from sim_server.simulation import Simulation
 
 KEY = "object.{}.effects.cutting.removed"
 LONGEST = 65536  # characters of `elements`
+FARTHEST = 1e9  # m, coordinates and radii of cuts
 KEPT = 256  # cuts of an object whose steps are kept, for frames that come late
 
 
@@ -71,8 +72,8 @@ def _chosen(simulation: Simulation, body: Body, wanted: pb.Cut) -> Int64:
         if len(corners) not in (3, 4):
             raise BadCut(f"blade has {len(corners)} corners; allowed: 3 or 4, of the surface that it sweeps")
         return met_by_blade(x, tets, corners)
-    if not 0 < wanted.radius < math.inf:
-        raise BadCut(f"radius = {wanted.radius:g} m: must be above 0 and finite")
+    if not 0 < wanted.radius <= FARTHEST:
+        raise BadCut(f"radius = {wanted.radius:g} m: must be above 0, at most {FARTHEST:g} m")
     return in_sphere(x, tets, _finite(wanted.center, "center"), wanted.radius)
 
 
@@ -80,17 +81,14 @@ def _listed(body: Body, text: str) -> Int64:
     if len(text) > LONGEST:
         raise BadCut(f"elements has {len(text)} characters: at most {LONGEST}")
     try:
-        found = numbers_of(text)
+        return numbers_of(text, len(body.mesh.tets))
     except ValueError as error:
         raise BadCut(f"elements: {error}") from None
-    if len(found) and found[-1] >= len(body.mesh.tets):
-        raise BadCut(f"elements has {found[-1]}: object {body.name!r} has elements 0 to {len(body.mesh.tets) - 1}")
-    return found
 
 
 def _finite(v: pb.Vector, what: str) -> Float64:
-    if not all(map(math.isfinite, (v.x, v.y, v.z))):
-        raise BadCut(f"{what} = {v.x:g} {v.y:g} {v.z:g}: must be finite")
+    if not all(abs(c) <= FARTHEST for c in (v.x, v.y, v.z)):
+        raise BadCut(f"{what} = {v.x:g} {v.y:g} {v.z:g}: must be finite, at most {FARTHEST:g} m each")
     return np.array([v.x, v.y, v.z])
 
 
@@ -106,6 +104,7 @@ class CutTelemetry:
             b.name: deque([(-1, 0)], maxlen=KEPT) for b in self._bodies.values()
         }  # steps before the first with it, and number, of cuts
         self._faces = {b.name: Faces.of(b.mesh.tets) for b in self._bodies.values()}
+        self._skins: dict[str, Int64] = {}  # element of each vertex
         self.removed: dict[str, int] = {}  # elements, by object
         if self._bodies:
             simulation.parameters.on_set.append(self._on_set)
@@ -124,11 +123,16 @@ class CutTelemetry:
         return next((number for taken, number in reversed(self._taken[name]) if taken < step), 0)
 
     def take(self) -> None:
-        """Tells of the cuts that the loop has taken up since the last call. To be called before frames are sent."""
+        """Tells of the cuts that the loop has taken up since the last call, before frames are sent."""
+        newest: dict[str, tuple[str, int]] = {}  # by key: of several cuts between two calls the last one is told
         while self._waiting and self._waiting[0].taken >= 0:
             update = self._waiting.popleft()
             for key in update.values.keys() & self._bodies.keys():
-                self._tell(self._bodies[key], numbers_of(json.loads(update.values[key])), update.taken)
+                first = newest[key][1] if key in newest else update.taken
+                newest[key] = json.loads(update.values[key]), first
+        for key, (text, taken) in newest.items():
+            body = self._bodies[key]
+            self._tell(body, numbers_of(text, len(body.mesh.tets)), taken)
 
     def _on_set(self, update: ParameterUpdate) -> None:
         if self._waiting and self._waiting[-1] is update.replaces:  # which the loop never took up
@@ -141,7 +145,7 @@ class CutTelemetry:
         number = self._taken[body.name][-1][1] + 1
         self._taken[body.name].append((step, number))
         self.removed[body.name] = len(removed)
-        change = partial(_without, body, self._faces[body.name], removed, number)
+        change = partial(_set_cut, self._cut_of(body, removed, number))
         self._link.renew_topology(body.name, change)
         if self._recorder is not None:
             message = pb.Topology(header=pb.Header(object=body.name, epoch=1), nodes=body.last - body.first)
@@ -149,16 +153,29 @@ class CutTelemetry:
             time = max(step, 0) * self._simulation.world.dt
             self._recorder.topology(message, block=self._patient, time=time)
 
+    def _cut_of(self, body: Body, removed: Int64, number: int) -> pb.Topology:
+        """Returns the fields of a topology that change once these elements are gone."""
+        present = np.ones(len(body.mesh.tets), bool)
+        present[removed] = False
+        found = pb.Topology(cut=number, removed=removed.astype("<i4").tobytes())
+        found.triangles = self._faces[body.name].surface(present).astype("<i4").tobytes()
+        if body.skin is not None:
+            if body.name not in self._skins:
+                self._skins[body.name] = _elements_of(body, body.skin)
+            there = present[self._skins[body.name]]
+            found.skin_triangles = body.skin.triangles[there[body.skin.triangles].all(axis=1)].astype("<i4").tobytes()
+        return found
 
-def _without(body: Body, faces: Faces, removed: Int64, number: int, message: pb.Topology) -> None:
-    """Sets what a topology has once these elements are gone."""
-    present = np.ones(len(body.mesh.tets), bool)
-    present[removed] = False
-    message.cut, message.removed = number, removed.astype("<i4").tobytes()
-    message.triangles = faces.surface(present).astype("<i4").tobytes()
-    if body.skin is not None:
-        corners = np.sort(body.mesh.tets, axis=1)
-        gone = {tuple(each) for each in corners[removed].tolist()}
-        there = np.array([tuple(each) not in gone for each in np.sort(body.skin.nodes, axis=1).tolist()])
-        kept = body.skin.triangles[there[body.skin.triangles].all(axis=1)]
-        message.skin_triangles = kept.astype("<i4").tobytes()
+
+def _elements_of(body: Body, skin: Skin) -> Int64:
+    """Returns the element that each vertex of a skin moves with, (s,)."""
+    order = np.lexsort(np.sort(body.mesh.tets, axis=1).T[::-1])
+    keys = [np.ascontiguousarray(np.sort(each, axis=1)).view([("", np.int32)] * 4).ravel() for each in
+            (body.mesh.tets[order].astype(np.int32), skin.nodes.astype(np.int32))]  # fmt: skip
+    return np.asarray(order[np.searchsorted(keys[0], keys[1])])
+
+
+def _set_cut(of: pb.Topology, message: pb.Topology) -> None:
+    message.cut, message.removed, message.triangles = of.cut, of.removed, of.triangles
+    if message.skin_triangles or of.skin_triangles:
+        message.skin_triangles = of.skin_triangles

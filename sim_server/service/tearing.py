@@ -6,7 +6,7 @@ import time
 
 import numpy as np
 
-from sim_server.arrays import Float64
+from sim_server.arrays import Float64, Int64
 from sim_server.mechanics.cut_shapes import torn
 from sim_server.mechanics.removal import present, removed_from, text_of
 from sim_server.mesh.shape_functions import shape_gradients
@@ -25,24 +25,30 @@ class Tearing:
             b for b in simulation.world.bodies if "cutting" in b.effects and b.effects["cutting"].tear is not None
         ]
         self._gradients: dict[int, Float64] = {}
+        self._seen: dict[int, Int64] = {}  # what was too long at the last look, by body
         self._due, self._step = 0.0, -1
 
     def look(self) -> None:
-        """Removes what is torn, if there is something to look at since the last call and it is due."""
+        """Removes what was too long at two looks in a row, if there is something to look at and it is due."""
         step = self._simulation.engine.step
         if not self._bodies or step == self._step or time.monotonic() < self._due:
             return
-        self._step = step
+        self._step, begin = step, time.monotonic()
         world, scene = self._simulation.world, self._simulation.parameters.scene
-        x, values = world.backend.fetch(world.x), {}
+        x, values = (
+            world.backend.fetch(world.x).copy(),
+            {},
+        )  # on a CPU the loop may be writing it: so a look is not enough
         for body in self._bodies:
             if body.index not in self._gradients:
                 self._gradients[body.index] = shape_gradients(body.mesh.rest, body.mesh.tets)[1]
             limit = scene.objects[body.index].effects["cutting"].tear  # type: ignore[attr-defined]
             there = present(scene, [body]) > 0
-            found = torn(x[body.nodes], body.mesh.tets, self._gradients[body.index], there, limit)
+            seen = torn(x[body.nodes], body.mesh.tets, self._gradients[body.index], there, limit)
+            found, self._seen[body.index] = np.intersect1d(seen, self._seen.get(body.index, seen[:0])), seen
             if len(found):
                 values[KEY.format(body.name)] = json.dumps(text_of(np.append(removed_from(scene, body), found)))
         if values:
             self._simulation.parameters.set(values)
-        self._due = time.monotonic() + PERIOD
+        end = time.monotonic()
+        self._due = end + max(PERIOD, end - begin)  # half of the time is for all else

@@ -202,8 +202,9 @@ class Telemetry:
 
     def frames(self) -> None:
         """Sends states and poses of obstacles, to the log at the scene's rate, the newest ones to viewers."""
-        self.cuts.take()
         frames = self.engine.frames()
+        if frames:
+            self.cuts.take()
         for step, x, v in frames:
             if self.record_every and step % self.record_every == 0:
                 self._record_frame(step, x, v, self.engine.frame_poses[step])
@@ -212,13 +213,14 @@ class Telemetry:
             self._publish_frame(step, x, v)
             self.contact.publish_poses(step, self.engine.frame_poses[step])
 
-    def _publish_frame(self, step: int, x: Float64, v: Float64) -> None:
+    def _publish_frame(self, step: int, x: Float64, v: Float64, shown: int | None = None) -> None:
         for body in self.simulation.world.bodies:
             if self.link.wants_state(body.name):
-                self.link.publish_state(self._state(body, step, x, v))
+                self.link.publish_state(self._state(body, step, x, v, shown))
 
-    def _state(self, body: Body, step: int, x: Float64, v: Float64) -> pb.State:
-        cut = self.cuts.number(body.name, step)
+    def _state(self, body: Body, step: int, x: Float64, v: Float64, shown: int | None = None) -> pb.State:
+        """shown: step whose surface it has, that of the frame if left out."""
+        cut = self.cuts.number(body.name, step if shown is None else shown)
         return messages.state(body, step, step * self.simulation.world.dt, x, v, cut)
 
     def on_reset(self, name: str, show: bool) -> None:
@@ -236,7 +238,8 @@ class Telemetry:
             self.recorder.reset(message, step * world.dt, block=self.patient)
         if show:
             self.simulation.fetch()
-            self._publish_frame(step, world.x, world.v)
+            self.cuts.take()
+            self._publish_frame(step, world.x, world.v, shown=step + 1)
 
     def frame_interval(self) -> int:
         """Returns the steps between frames that the loop should copy out; 0 for none."""
@@ -280,6 +283,7 @@ class Telemetry:
             return
         self._due["status"] = time.monotonic() + STATUS_PERIOD
         self._renew_moduli()
+        self.cuts.take()
         loop, world = self.engine.loop, self.simulation.world
         p50, p99, most = self.percentiles()
         status = pb.Status(

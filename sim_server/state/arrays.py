@@ -42,7 +42,7 @@ def launch_arrays(simulation: Simulation) -> list[StateArray]:
         for member, array in launch.written():
             if member in DERIVED or not array.size or id(array) in found:
                 continue
-            name = f"{launch.name}.{member}"
+            name = _unused(f"{launch.name}.{member}", {each.name for each in found.values()})
             resets = member not in TOTALS and id(array) not in moved
             found[id(array)] = _array(simulation, name, array, launch, resets)
     w = simulation.world
@@ -53,6 +53,11 @@ def launch_arrays(simulation: Simulation) -> list[StateArray]:
         if array.size and id(array) not in found:
             found[id(array)] = _array(simulation, name, array, None, True)
     return list(found.values())
+
+
+def _unused(name: str, used: set[str]) -> str:
+    """Returns the name, or with a number behind it where several effects have one text."""
+    return next(n for n in (name, *(f"{name}#{k}" for k in range(2, len(used) + 3))) if n not in used)
 
 
 def _array(

@@ -175,7 +175,7 @@ def test_what_a_cut_opens_touches_obstacles_and_what_is_gone_does_not():
     ("keys", "says"),
     [
         ({"integrator": {"scheme": "quasi_static"}}, "quasi_static"),
-        ({"own": {"cutting": {"removed": "3 99999"}}}, "removed has element 99999; it has 192"),
+        ({"own": {"cutting": {"removed": "3 99999"}}}, "removed: there is no element 99999: numbers are from 0 to 191"),
         ({"own": {"traction": {"where": "X > 1.9", "pressure": 1.0}}}, "with the effect traction"),
     ],
 )

@@ -65,10 +65,19 @@ def test_what_is_stretched_too_far_is_torn_whichever_way_it_turns():
     assert not set(torn(x, MESH.tets, gradients, without, 1.49)) & set(found)
 
 
+def test_positions_that_are_no_numbers_tear_nothing():
+    _, gradients = shape_gradients(MESH.rest, MESH.tets)
+    x = MESH.rest.copy()
+    x[5], x[9] = np.nan, 1e300
+    torn(x, MESH.tets, gradients, np.ones(len(MESH.tets), bool), 1.5)
+
+
 def test_texts_of_numbers_are_read_back():
     for numbers in ([], [0], [3, 4, 5], [9, 1, 2, 3, 20, 1], list(range(0, 40, 2))):
-        assert numbers_of(text_of(numbers)).tolist() == sorted(set(numbers))
+        assert numbers_of(text_of(numbers), 50).tolist() == sorted(set(numbers))
     assert text_of([3, 7, 8, 9, 12]) == "3 7-9 12"
+    with pytest.raises(ValueError, match="no element 9999999"):
+        numbers_of("0-9999999 " * 5000 + "50", 50)
 
 
 @pytest.mark.parametrize("share", [1.0, 0.7, 0.3, 0.0])

@@ -126,6 +126,24 @@ def test_a_free_body_with_a_gas_moves_on(tmp_path, preconditioner):
     np.testing.assert_allclose(sim.world.mass @ sim.fetch().v / sim.world.mass.sum(), [1, -2, 0.5], atol=1e-7)
 
 
+@pytest.mark.parametrize("law", [{"amount": 1.2}, {"volume": 0.2, "bulk": 1e5}])
+def test_walls_that_are_fixed_stay(tmp_path, law):
+    """Half of the chamber is clamped: its nodes keep their places to the bit, and the rest is blown up."""
+    sim = loaded(hollow(tmp_path, {"where": INSIDE} | law, fixed={"where": "X < 0.3"}))
+    held, wall = sim.world.free == 0, np.zeros(sim.world.nodes, bool)
+    wall[sim.effects["cavity"].node] = True  # type: ignore[attr-defined]
+    assert (held & wall).any() and (wall & ~held).any()
+    x = sim.world.x.copy()
+    sim.engine.run(20)
+    assert np.array_equal(sim.world.x[held], x[held]) and not sim.world.v[held].any()
+    assert np.abs(sim.world.x - x).max() > 1e-4
+
+
+def test_a_gas_between_walls_that_slide_is_refused(tmp_path):
+    with pytest.raises(InputError, match="fixed along some directions only"):
+        loaded(hollow(tmp_path, {"where": INSIDE, "amount": 1.2}, fixed={"where": "X < 0.3", "along": "x"}))
+
+
 @pytest.mark.parametrize("cavity", [{"amount": 1.05}, {"volume": 0.127, "bulk": 1e6}, {"pressure": 500.0}])
 def test_energy_is_kept(tmp_path, cavity):
     """By explicit substeps: of gas and liquid, or the work of a given pressure; the balance has the same."""

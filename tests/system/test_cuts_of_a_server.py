@@ -42,13 +42,18 @@ def cut_about(client: Client) -> None:
     assert said.returncode == 0 and "elements removed" in said.stdout, said.stderr
     left = client.cut("beam", elements="0-2").left
     for bad, why in (
-        ({}, "one of blade, radius, where and elements"), ({"elements": "540"}, "elements 0 to 539"),
-        ({"where": "Q > 1"}, "Q"), ({"blade": [(0, 0, 0)]}, "1 corners"), ({"elements": "a"}, "element numbers"),
+        ({}, "one of blade, radius, where and elements"), ({"where": "Q > 1"}, "Q"),
+        ({"blade": [(0, 0, 0)]}, "1 corners"),
+        ({"elements": "540"}, "from 0 to 539"), ({"elements": "a"}, "element numbers"),
+        ({"elements": "0-9999999 " * 6000}, "no element 9999999"),
+        ({"center": (0, 0, 0), "radius": 1e200}, "at most 1e"), ({"blade": [(1e300, 0, 0)] * 3}, "at most 1e"),
     ):  # fmt: skip
         with pytest.raises(BadInput, match=why):
             client.cut("beam", **bad)
     with pytest.raises(BadInput, match="no object 'liver'"):
         client.cut("liver", where="true")
+    with pytest.raises(BadInput, match="removed by the command cut"):
+        client.set("beam.cutting.removed", '""')
     assert not any("removed" in p.now.key for p in client.parameters()), "changed by a command of its own"
     client.resume()
     until(lambda: len(client.meshes()["beam"].tets) == left, "who asks is told what is left")

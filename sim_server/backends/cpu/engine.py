@@ -406,6 +406,7 @@ class _NativeContact:
         native.body = c.addressof(self._references)
 
 
+LARGEST_CUT = 4_000_000  # entries of the envelope
 WIDEST_CUT = 30 * 9  # as ENOUGH_FOR_CUTS of native/cut_nodes.h, in numbers of A a block
 
 
@@ -415,7 +416,7 @@ class _NativeCut:
     def __init__(self, given: CutInput, body: Any, dt: float, arrays: Mapping[str, NDArray[Any]]):
         n = body.last - body.first
         blocks = int(arrays["row_start"][body.last] - arrays["row_start"][body.first])
-        capacity = int((WIDEST_CUT * blocks * 3 * n) ** 0.5)  # rows of these widths have no more entries
+        capacity = min(int((WIDEST_CUT * blocks * 3 * n) ** 0.5), LARGEST_CUT)  # rows of these widths have no more
         room: dict[str, NDArray[Any]] = {
             "node": np.zeros(n, np.int32), "place": np.zeros(n, np.int32), "first": np.zeros(3 * n, np.int32),
             "row": np.zeros(3 * n, np.int64), "envelope": np.zeros(capacity), "t": np.zeros(3 * n),

@@ -10,6 +10,7 @@ struct RankOne {
     const int32_t* node;     // of the scene
     const double* slope;     // (nodes of parts, 3) u, world frame
     const double* scale;     // (parts, 4) at 2: factor [kg over the square of u]
+    const double* free;      // (nodes of the scene,) 0 at fixed nodes, where u counts as 0
     const double* rotation;  // (nodes, 3, 3) of the scene: world from material frame
 };
 
@@ -22,6 +23,7 @@ static double add_product(const RankOne& terms, int body, int at, const double* 
         double along = 0;
         auto each = [&](auto visit) {
             for (int k = terms.start[part]; k < terms.start[part + 1]; ++k) {
+                if (terms.free[terms.node[k]] == 0) continue;
                 const double *R = terms.rotation + 9 * (int64_t)terms.node[k], *u = terms.slope + 3 * (int64_t)k;
                 const int64_t i = 3 * (int64_t)(terms.node[k] - at);
                 for (int c = 0; c < 3; ++c) visit(i + c, R[c] * u[0] + R[3 + c] * u[1] + R[6 + c] * u[2]);
