@@ -18,7 +18,7 @@ GROUP = "warpfactor.effects"
 TEXTS = (".py", ".cu", ".cuh", ".h")
 PARTS = ("SCOPE", "Params", "build")  # that the module of an effect has, beside its docstring
 
-_loaded: dict[str, tuple[ModuleType, str]] = {}  # by effect: module, and package with version
+_loaded: dict[str, tuple[ModuleType, "Code"]] = {}  # by effect
 
 
 @dataclass(frozen=True)
@@ -59,7 +59,7 @@ def load(name: str) -> ModuleType | None:
             f"effect {name!r} of {package}: {point.value} cannot be imported: {type(error).__name__}: {error}"
         ) from error
     _check(module, f"effect {name!r} of {package}: {point.value}")
-    _loaded[name] = module, package
+    _loaded[name] = module, Code(name, package, _digest(module))  # before it imports more, as it may at any time
     return module  # type: ignore[no-any-return]
 
 
@@ -86,11 +86,14 @@ def effect_of(module: str) -> str:
 
 def code_of(name: str) -> Code:
     """Returns what code an effect that is loaded is."""
-    module, package = _loaded[name]
+    return _loaded[name][1]
+
+
+def _digest(module: ModuleType) -> str:
     digest = hashlib.sha256()
     for file in _files(module):
         digest.update(file.name.encode() + b"\0" + file.read_bytes() + b"\0")
-    return Code(name, package, digest.hexdigest()[:16])
+    return digest.hexdigest()[:16]
 
 
 def _files(module: ModuleType) -> list[Path]:
