@@ -124,7 +124,7 @@ def test_too_much_shrinking_is_refused():
     with pytest.raises(InputError, match=r"expansion amount is 0\.04: must be from 0\.05 to 100"):
         growing({"expansion": -0.96})
     sim = growing({"expansion": -0.5})
-    with pytest.raises(BadParameter, match=r"must be 0\.05 or more"):
+    with pytest.raises(BadParameter, match=r"must be from 0\.05 to 100"):
         sim.parameters.set({"bar.growth.amount": "3.0"})
 
 
