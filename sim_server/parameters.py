@@ -142,10 +142,9 @@ class LiveParameters:
             self._give(scene, changed, client)
         return [self._described(new[key]) for key in given]
 
-    def take_back(self, ending: str, objects: Sequence[str]) -> None:
-        """Sets the parameters of these objects whose keys end so to what they were at the start."""
-        keys = {f"object.{name}.effects{ending}" for name in objects} & self.changed.keys()
-        if keys:
+    def take_back(self, keys: Iterable[str]) -> None:
+        """Sets those of these parameters that have changed to what they were at the start."""
+        if keys := set(keys) & self.changed.keys():
             self.set({key: toml(_plain(self._start[key])) for key in keys})
 
     def known_to_workers_at(self, step: int) -> bool:

@@ -66,6 +66,7 @@ class Params(Parameters):
 class Cutting(Effect):
     """Removed elements of all bodies that list the effect.
 
+    faces: of the meshes of these bodies, by index
     surface (n,): 1 at nodes of the surface; touchable (n,): 1 at those that move, which alone touch obstacles
     left (n,): part of each node's elements that is there; at_rest (n,): 1 at free nodes without any; changed_at (n,):
     time at which a node last lost or got back an element [s], -1: never
@@ -73,6 +74,7 @@ class Cutting(Effect):
 
     def __init__(self, world: World, listed: list[tuple[Body, Any]]):
         self.world, self.bodies = world, [body for body, _ in listed]
+        self._counted: tuple[Scene, Float64] | None = None
         if not world.inertia:
             raise InputError(
                 f"object {self.bodies[0].name!r}, effect cutting: pieces that come apart need inertia, which the "
@@ -85,9 +87,9 @@ class Cutting(Effect):
             )
         n, masses = world.nodes, world.mass.copy()
         world.uncut_mass = masses
-        world.follow_into(world.mass, "cutting", compute=lambda scene: masses_left(scene, world, masses))
-        self.left = world.follow("cutting", compute=lambda scene: present_nodes(scene, world))
-        self._faces = {body.index: Faces.of(body.mesh.tets) for body in self.bodies}
+        world.follow_into(world.mass, "cutting", compute=lambda scene: masses_left(self._parts(scene), masses))
+        self.left = world.follow("cutting", compute=lambda scene: self._parts(scene).copy())
+        self.faces = {body.index: Faces.of(body.mesh.tets) for body in self.bodies}
         self.surface = world.follow("cutting", compute=self._on_surface)
         self.touchable = world.touchable = np.ones(n)
         world.backend.keep(self.touchable)
@@ -96,11 +98,17 @@ class Cutting(Effect):
         world.backend.keep(self._before, self.at_rest)
         world.backend.keep(self.changed_at, exact=True)
 
+    def _parts(self, scene: Scene) -> Float64:
+        """Returns `left` by the parameters of a scene, which two arrays ask for one after the other."""
+        if self._counted is None or self._counted[0] is not scene:
+            self._counted = scene, present_nodes(scene, self.world)
+        return self._counted[1]
+
     def _on_surface(self, scene: Scene) -> Float64:
         """Returns 1 for nodes of surfaces, and for those of objects that are not cut."""
         out = np.ones(self.world.nodes)
         for body in self.bodies:
-            triangles = self._faces[body.index].surface(present(scene, [body]))
+            triangles = self.faces[body.index].surface(present(scene, [body]))
             out[body.nodes] = 0
             out[triangles.ravel() + body.first] = 1
         return out

@@ -108,7 +108,7 @@ class Damage(TetrahedraWithHistory):
         lam, mu = self.elasticity(scene)
         young = mu * (3 * lam + 2 * mu) / (lam + mu)
         strength, energy = self.packed_in(LAW, scene)
-        size = np.cbrt(6 * np.sqrt(2) * self.volume)
+        size = np.cbrt(6 * np.sqrt(2) * self.rest.volume(scene))
         softening = energy / (size * strength) - 0.5 * strength / young
         if not (softening > 0).all():
             worst = int(np.argmin(softening / strength))

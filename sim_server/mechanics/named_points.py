@@ -30,14 +30,17 @@ class NamedPoints:
         self._world = world
         self._x: Float64 = np.zeros((0, 3))
         self._moves = (world.free[body.nodes] > 0) | self._without_elements()
-        self.free: NDArray[np.bool_] = self._moves & ~self._without_elements()
         self.size = float(np.linalg.norm(np.ptp(body.mesh.rest, axis=0)))  # m, diagonal of the box at rest
+
+    @property
+    def free(self) -> NDArray[np.bool_]:
+        """Which of its nodes move now, (nodes,)."""
+        return self._moves & ~self._without_elements()
 
     def now(self, x: Float64 | None = None) -> Float64:
         """Copies and returns positions of its nodes [m], (nodes, 3). x: of all nodes of the scene; None: fetch them."""
         fetched = self._world.backend.fetch(self._world.x) if x is None else x
         self._x = fetched[self.body.nodes].copy()
-        self.free = self._moves & ~self._without_elements()
         return self._x
 
     def _without_elements(self) -> NDArray[np.bool_]:

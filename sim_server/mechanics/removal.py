@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Elements that a scene and its parameters have removed from an object, and what is left without them."""
 
+import json
 import re
 from collections.abc import Sequence
 from functools import lru_cache
@@ -13,6 +14,7 @@ from sim_server.mechanics.world import Body, World
 from sim_server.scene import Scene
 
 NUMBERS = re.compile(r"\s*(\d{1,9})(?:-(\d{1,9}))?(?:\s+|$)")
+KEY = "object.{}.effects.cutting.removed"  # of the parameter, by the object's name
 LEAST_MASS = 1e-6  # of its own, which a node without elements keeps, since equations divide by it
 
 
@@ -67,6 +69,11 @@ def removed_from(scene: Scene, body: Body) -> Int64:
         raise InputError(f"object {body.name!r}, effect cutting: removed: {error}") from None
 
 
+def removal(scene: Scene, body: Body, numbers: Int64) -> dict[str, str]:
+    """Returns the parameter, by its key as TOML, with which a scene has no such elements either."""
+    return {KEY.format(body.name): json.dumps(text_of(np.append(removed_from(scene, body), numbers)))}
+
+
 def present(scene: Scene, bodies: Sequence[Body]) -> Float64:
     """Returns 1 for each element of these bodies, one after another, 0 for those that the scene has removed."""
     parts = [np.ones(len(body.mesh.tets)) for body in bodies]
@@ -92,7 +99,6 @@ def present_nodes(scene: Scene, world: World) -> Float64:
     return out
 
 
-def masses_left(scene: Scene, world: World, masses: Float64) -> Float64:
-    """Returns the nodal masses without the removed elements [kg]. masses (nodes,): with all of them."""
-    part = present_nodes(scene, world)
+def masses_left(part: Float64, masses: Float64) -> Float64:
+    """Returns the nodal masses without removed elements [kg]. part: of present_nodes; masses: with all elements."""
     return np.where(part > 0, part, LEAST_MASS) * masses

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim_server.arrays import Float64, Int32, Int64
-from sim_server.mesh.surface import FACES
+from sim_server.mesh.surface import FACES, grouped_faces
 
 
 @dataclass(frozen=True)
@@ -22,9 +22,7 @@ class Faces:
     def of(cls, tets: Int32) -> "Faces":
         """Returns the faces of elements (m, 4) of positive volume."""
         corners = tets[:, FACES].reshape(-1, 3)
-        key = np.sort(corners, axis=1)
-        order = np.lexsort(key.T)
-        first = np.concatenate([[True], (np.diff(key[order], axis=0) != 0).any(axis=1)])
+        order, first = grouped_faces(tets)
         number = np.cumsum(first) - 1
         second = np.flatnonzero(~first)
         both = np.full((number[-1] + 1, 2), -1)

@@ -24,12 +24,17 @@ def surface_triangles(tets: NDArray[np.integer]) -> Int32:
 
 def surface_faces(tets: NDArray[np.integer]) -> Int64:
     """Returns the numbers of the faces of one tetrahedron only, (t,) ascending: 4 times its own + row of FACES."""
+    order, starts = grouped_faces(tets)
+    single = starts & np.append(starts[1:], True)
+    return np.sort(order[single])
+
+
+def grouped_faces(tets: NDArray[np.integer]) -> tuple[Int64, NDArray[np.bool_]]:
+    """Returns the numbers of all faces, those with the same nodes together, and where others begin, (4 m,) each."""
     corners = np.sort(tets[:, FACES].reshape(-1, 3), axis=1)
     order = np.lexsort(corners.T)
     differs = np.any(np.diff(corners[order], axis=0) != 0, axis=1)
-    starts = np.concatenate([[True], differs])  # where a new face begins in sorted order
-    single = starts & np.concatenate([differs, [True]])
-    return np.sort(order[single])
+    return order, np.concatenate([[True], differs])
 
 
 def surface_edges(triangles: Int32) -> tuple[Int32, Int32, Int32]:

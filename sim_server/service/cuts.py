@@ -11,9 +11,8 @@ from protocol import messages_pb2 as pb
 from sim_server.arrays import Float64, Int64
 from sim_server.errors import InputError
 from sim_server.mechanics.cut_shapes import in_sphere, met_by_blade
-from sim_server.mechanics.removal import numbers_of, removed_from, text_of
+from sim_server.mechanics.removal import KEY, numbers_of, removal, removed_from
 from sim_server.mechanics.world import Body
-from sim_server.mesh.faces import Faces
 from sim_server.mesh.skin import Skin
 from sim_server.network.link import ServerLink
 from sim_server.parameters import ParameterUpdate
@@ -21,7 +20,6 @@ from sim_server.recording.recorder import Recorder
 from sim_server.scene import where
 from sim_server.simulation import Simulation
 
-KEY = "object.{}.effects.cutting.removed"
 LONGEST = 65536  # characters of `elements`
 FARTHEST = 1e9  # m, coordinates and radii of cuts
 KEPT = 256  # cuts of an object whose steps are kept, for frames that come late
@@ -40,8 +38,7 @@ def carry_out(simulation: Simulation, wanted: pb.Cut, client: str) -> pb.Reply:
     except InputError as error:
         raise BadCut(str(error)) from None
     if len(found):
-        text = text_of(np.concatenate([known, found]))
-        simulation.parameters.set({KEY.format(body.name): json.dumps(text)}, client)
+        simulation.parameters.set(removal(scene, body, found), client)
     return pb.Reply(removed=len(found), left=len(body.mesh.tets) - len(known) - len(found))
 
 
@@ -103,7 +100,6 @@ class CutTelemetry:
         self._taken: dict[str, deque[tuple[int, int]]] = {
             b.name: deque([(-1, 0)], maxlen=KEPT) for b in self._bodies.values()
         }  # steps before the first with it, and number, of cuts
-        self._faces = {b.name: Faces.of(b.mesh.tets) for b in self._bodies.values()}
         self._skins: dict[str, Int64] = {}  # element of each vertex
         self.removed: dict[str, int] = {}  # elements, by object
         if self._bodies:
@@ -155,10 +151,11 @@ class CutTelemetry:
 
     def _cut_of(self, body: Body, removed: Int64, number: int) -> pb.Topology:
         """Returns the fields of a topology that change once these elements are gone."""
+        assert self._simulation.cutting is not None
         present = np.ones(len(body.mesh.tets), bool)
         present[removed] = False
         found = pb.Topology(cut=number, removed=removed.astype("<i4").tobytes())
-        found.triangles = self._faces[body.name].surface(present).astype("<i4").tobytes()
+        found.triangles = self._simulation.cutting.faces[body.index].surface(present).astype("<i4").tobytes()
         if body.skin is not None:
             if body.name not in self._skins:
                 self._skins[body.name] = _elements_of(body, body.skin)

@@ -1,19 +1,17 @@
 # SPDX-License-Identifier: MIT
 """Removes elements that are stretched too far, as a client would: beside the steps, by the parameter of the effect."""
 
-import json
 import time
 
 import numpy as np
 
 from sim_server.arrays import Float64, Int64
 from sim_server.mechanics.cut_shapes import torn
-from sim_server.mechanics.removal import present, removed_from, text_of
+from sim_server.mechanics.removal import present, removal
 from sim_server.mesh.shape_functions import shape_gradients
 from sim_server.simulation import Simulation
 
 PERIOD = 0.02  # s between two looks
-KEY = "object.{}.effects.cutting.removed"
 
 
 class Tearing:
@@ -35,10 +33,8 @@ class Tearing:
             return
         self._step, begin = step, time.monotonic()
         world, scene = self._simulation.world, self._simulation.parameters.scene
-        x, values = (
-            world.backend.fetch(world.x).copy(),
-            {},
-        )  # on a CPU the loop may be writing it: so a look is not enough
+        x = world.backend.fetch(world.x).copy()  # on a CPU the loop may be writing it: so one look is not enough
+        values: dict[str, str] = {}
         for body in self._bodies:
             if body.index not in self._gradients:
                 self._gradients[body.index] = shape_gradients(body.mesh.rest, body.mesh.tets)[1]
@@ -47,7 +43,7 @@ class Tearing:
             seen = torn(x[body.nodes], body.mesh.tets, self._gradients[body.index], there, limit)
             found, self._seen[body.index] = np.intersect1d(seen, self._seen.get(body.index, seen[:0])), seen
             if len(found):
-                values[KEY.format(body.name)] = json.dumps(text_of(np.append(removed_from(scene, body), found)))
+                values |= removal(scene, body, found)
         if values:
             self._simulation.parameters.set(values)
         end = time.monotonic()

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim_server.backends.state import StateArray
+from sim_server.mechanics.removal import KEY
 from sim_server.simulation import Simulation
 from sim_server.state.arrays import launch_arrays, state_arrays
 
@@ -37,7 +38,7 @@ class Start:
         """
         s = self._simulation
         bodies = [s.world.body(name).index] if name else [b.index for b in s.world.bodies]
-        s.parameters.take_back(".cutting.removed", [s.world.bodies[index].name for index in bodies])
+        s.parameters.take_back(KEY.format(s.world.bodies[index].name) for index in bodies)
         s.engine.take_changes()
         back = self._arrays if not name else [(a, _with_rows(a, v, bodies[0])) for a, v in self._arrays if a.rows]
         for array, value in back:

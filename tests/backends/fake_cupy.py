@@ -8,14 +8,18 @@ while decisions of kernels are those that a test gives in their place.
 
 import ctypes as c
 import re
-from collections.abc import Callable
-from contextlib import AbstractContextManager
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 from typing import Any
 
 import numpy as np
 
+from sim_server.backends.gpu import device
+from sim_server.backends.gpu import engine as gpu_engine
+from sim_server.backends.gpu.inverse.workspace import workspace
 from tests.backends.fake_cuda import FakeDevice
 from tests.backends.fake_graphs import Graphs, Work
 from tests.support import nvrtc
@@ -95,6 +99,19 @@ class Device(FakeDevice):
 def end_search(arguments: Any) -> None:
     """In place of `accept_trial` (newton.cu): no body needs another trial."""
     c.c_int32.from_address(int(arguments["active"])).value = 0
+
+
+@contextmanager
+def installed(folder: Path, library: Any, monkeypatch: Any) -> Iterator[ModuleType]:
+    """Context in which scenes for a GPU are built with the module that `made` returns."""
+    fake, caches = made(folder, library), (device.cupy, device.processors, workspace)
+    monkeypatch.setitem(sys.modules, "cupy", fake)
+    monkeypatch.setattr(gpu_engine, "CudaDevice", Device)
+    for function in caches:
+        function.cache_clear()
+    yield fake
+    for function in caches:
+        function.cache_clear()
 
 
 def made(folder: Path, library: Any) -> ModuleType:

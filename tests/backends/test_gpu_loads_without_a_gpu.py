@@ -1,14 +1,10 @@
 # SPDX-License-Identifier: MIT
 """Scenes with loads are built for a GPU where there is none: texts compile with the options of a run."""
 
-import sys
 from typing import Any
 
 import pytest
 
-from sim_server.backends.gpu import device
-from sim_server.backends.gpu import engine as gpu_engine
-from sim_server.backends.gpu.inverse.workspace import workspace
 from sim_server.backends.gpu.kernel_fusion import DOMAINS
 from sim_server.errors import InputError
 from sim_server.simulation import Simulation
@@ -45,14 +41,8 @@ SCHEMES = [("backward_euler", "mixed"), ("ros2", "float64"), ("central_differenc
 def cupy(tmp_path, monkeypatch):
     if (library := nvrtc.library()) is None:
         pytest.skip("needs the package nvidia-cuda-nvrtc")
-    fake = fake_cupy.made(tmp_path, library)
-    monkeypatch.setitem(sys.modules, "cupy", fake)
-    monkeypatch.setattr(gpu_engine, "CudaDevice", fake_cupy.Device)
-    for function in (device.cupy, device.processors, workspace):
-        function.cache_clear()
-    yield fake
-    for function in (device.cupy, device.processors, workspace):
-        function.cache_clear()
+    with fake_cupy.installed(tmp_path, library, monkeypatch) as fake:
+        yield fake
 
 
 @pytest.mark.parametrize(("scheme", "precision"), SCHEMES)

@@ -3,7 +3,6 @@
 
 import ctypes as c
 import re
-import sys
 from collections.abc import Iterator
 from types import ModuleType, SimpleNamespace
 from typing import Any
@@ -11,11 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sim_server.backends.gpu import device
-from sim_server.backends.gpu import engine as gpu_engine
 from sim_server.backends.gpu.cuda import CudaDevice
 from sim_server.backends.gpu.engine import FEW
-from sim_server.backends.gpu.inverse.workspace import workspace
 from sim_server.errors import DeviceError, InputError
 from sim_server.scene.integrator_options import MAX_STATES
 from sim_server.simulation import Simulation
@@ -30,14 +26,8 @@ TRIAL = ["pcg", "update_state", "elements", "nodes", "accept_trial"]
 @pytest.fixture
 def cupy(tmp_path: Any, monkeypatch: pytest.MonkeyPatch) -> Iterator[ModuleType]:
     monkeypatch.setattr(nvrtc, "compiled", lambda *_: (b"code", ""))
-    fake = fake_cupy.made(tmp_path, None)
-    monkeypatch.setitem(sys.modules, "cupy", fake)
-    monkeypatch.setattr(gpu_engine, "CudaDevice", fake_cupy.Device)
-    for function in (device.cupy, device.processors, workspace):
-        function.cache_clear()
-    yield fake
-    for function in (device.cupy, device.processors, workspace):
-        function.cache_clear()
+    with fake_cupy.installed(tmp_path, None, monkeypatch) as fake:
+        yield fake
 
 
 def simulation(monkeypatch: pytest.MonkeyPatch, loops: bool, **options: Any) -> Simulation:

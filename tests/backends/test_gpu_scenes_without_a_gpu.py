@@ -1,17 +1,13 @@
 # SPDX-License-Identifier: MIT
 """Scenes are built for a GPU where there is none: texts compile with the options of a run, and launches fit kernels."""
 
-import sys
-
 import numpy as np
 import pytest
 
 from precond_worker.factorization.factorize import Analysis
 from sim_server.backends.gpu import device
-from sim_server.backends.gpu import engine as gpu_engine
 from sim_server.backends.gpu.inverse.build_inverse import InverseBuilder
 from sim_server.backends.gpu.inverse.plan import plan
-from sim_server.backends.gpu.inverse.workspace import workspace
 from sim_server.backends.gpu.islands import OWN_SURFACES
 from sim_server.checkpoint.content import capture
 from sim_server.explain.explanation import explain
@@ -101,14 +97,8 @@ SCENES = {
 def cupy(tmp_path, monkeypatch):
     if (library := nvrtc.library()) is None:
         pytest.skip("needs the package nvidia-cuda-nvrtc")
-    fake = fake_cupy.made(tmp_path, library)
-    monkeypatch.setitem(sys.modules, "cupy", fake)
-    monkeypatch.setattr(gpu_engine, "CudaDevice", fake_cupy.Device)
-    for function in (device.cupy, device.processors, workspace):
-        function.cache_clear()
-    yield fake
-    for function in (device.cupy, device.processors, workspace):
-        function.cache_clear()
+    with fake_cupy.installed(tmp_path, library, monkeypatch) as fake:
+        yield fake
 
 
 @pytest.mark.parametrize("name", SCENES)

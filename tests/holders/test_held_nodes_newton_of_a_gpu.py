@@ -2,15 +2,12 @@
 """Holders with Newton-Raphson on a GPU: its kernels, run by threads of the processor, beside the loop of the CPU."""
 
 import ctypes as c
-import sys
 from typing import Any
 
 import numpy as np
 import pytest
 
-from sim_server.backends.gpu import device, kernel_fusion
-from sim_server.backends.gpu import engine as gpu_engine
-from sim_server.backends.gpu.inverse.workspace import workspace
+from sim_server.backends.gpu import kernel_fusion
 from tests.backends import fake_cupy
 from tests.backends.newton_on_threads import OnThreads, compiled
 from tests.holders.holder_scenes import held_bar, left, right
@@ -47,11 +44,6 @@ def test_steps_and_forces_are_those_of_the_cpu(library, monkeypatch, scheme):
 def test_later_assemblies_leave_what_the_forces_are_made_of(tmp_path, monkeypatch):
     """The right-hand side at held nodes of the last one: no array that stays in registers. Without holders it may."""
     monkeypatch.setattr(nvrtc, "compiled", lambda *_: (b"code", ""))
-    monkeypatch.setitem(sys.modules, "cupy", fake_cupy.made(tmp_path, None))
-    monkeypatch.setattr(gpu_engine, "CudaDevice", fake_cupy.Device)
-    caches = (device.cupy, device.processors, workspace)
-    for function in caches:
-        function.cache_clear()
     asked, fused = [], kernel_fusion.FusedSource
 
     def source(launches: Any, shape: Any, epilogue: Any, private: frozenset[int], guard: Any, *rest: Any) -> Any:
@@ -61,10 +53,9 @@ def test_later_assemblies_leave_what_the_forces_are_made_of(tmp_path, monkeypatc
 
     monkeypatch.setattr(kernel_fusion, "FusedSource", source)
     newton = {"scheme": "newmark", "linearizations": 3}
-    for holders, kept in (((left(),), False), ((), True)):
-        asked.clear()
-        sim = held_bar(*holders, integrator=newton, device="gpu", **({} if holders else {"fixed": "X < 0.01"}))
-        b = int(sim.engine.gpu.twin(sim.system.b).data.ptr)
-        assert asked and any(b in private for private in asked) == kept
-    for function in caches:
-        function.cache_clear()
+    with fake_cupy.installed(tmp_path, None, monkeypatch):
+        for holders, kept in (((left(),), False), ((), True)):
+            asked.clear()
+            sim = held_bar(*holders, integrator=newton, device="gpu", **({} if holders else {"fixed": "X < 0.01"}))
+            b = int(sim.engine.gpu.twin(sim.system.b).data.ptr)
+            assert asked and any(b in private for private in asked) == kept
