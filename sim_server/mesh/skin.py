@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sim_server.arrays import Float64, Int32, Int64
 from sim_server.errors import InputError
@@ -77,13 +78,25 @@ def embed(points: Float64, mesh: Mesh) -> tuple[Int32, Float64, Float64]:
 
     Raises InputError for a point that is farther outside than MOST_OUTSIDE.
     """
-    gradients = shape_gradients(mesh.rest, mesh.tets)[1]
-    gradients = np.concatenate([-gradients.sum(axis=1, keepdims=True), gradients], axis=1)
+    gradients = _gradients(mesh)
     tet, depth = _deepest(points, mesh, gradients)
     distance, size = np.zeros(len(points)), _size(mesh)
     if (out := np.flatnonzero(~(depth >= -ROUNDING * size))).size:
         tet[out], distance[out] = _nearest(points[out], mesh, MOST_OUTSIDE * size)
     return mesh.tets[tet], _bounded(_weights(points, tet, mesh, gradients)), distance
+
+
+def contained(points: Float64, mesh: Mesh) -> tuple[Int32, Float64, NDArray[np.bool_]]:
+    """Returns nodes (s, 4) and weights (s, 4) of points (s, 3), and which lie in the mesh, (s,); the others have no use."""
+    gradients = _gradients(mesh)
+    tet, depth = _deepest(points, mesh, gradients)
+    return mesh.tets[tet], _weights(points, tet, mesh, gradients), depth >= -COUNTED * _size(mesh)
+
+
+def _gradients(mesh: Mesh) -> Float64:
+    """Returns the gradients of the barycentric coordinates of all tetrahedra, (m, 4, 3) [1/m]."""
+    of_three = shape_gradients(mesh.rest, mesh.tets)[1]
+    return np.concatenate([-of_three.sum(axis=1, keepdims=True), of_three], axis=1)
 
 
 def _size(mesh: Mesh) -> float:
