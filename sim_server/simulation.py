@@ -86,7 +86,7 @@ class Simulation:
         if self.holders and self.touch:
             self.holders.use_load(self.touch.force)
         self.fixed = self.world.free == 0  # at the start, when the pattern of A is made; later nodes may come to rest
-        elements = [e.elements for e in self.effects.values() if e.elements is not None]
+        elements = [e.elements for e in self.effects.values() if e.elements is not None and e.holds]
         self.system = System(self.world, [e.coupled for e in self.effects.values() if e.coupled is not None])
         matched = self._matched()
         self.shape = ShapeMatching(self.world, matched, solver.warp_level) if matched else None

@@ -49,7 +49,9 @@ class Effect:
     """Base of all effects. A file under effects/ has `build(world, listed) -> Effect`.
 
     name: as scenes list it.
-    elements (m, c): node numbers (of the scene) of the elements whose c = 2 or 4 corners the effect couples, or None.
+    elements (m, c): node numbers (of the scene) of the elements whose c corners the effect couples, or None. A corner
+        without a part in anything may repeat another one.
+    holds: whether its elements count where a scene without inertia asks if every part is held.
     rotated: the bodies whose elements add their rotations to system.mean for the warp; nodes of other bodies get
     theirs by shape matching. elastic: by body index, Young's modulus [Pa] and Poisson's ratio of its elements, (m,)
     each, for viewers.
@@ -57,6 +59,7 @@ class Effect:
 
     name = ""
     elements: Int32 | None = None
+    holds = True
     rotated: tuple[Body, ...] = ()
     elastic: Mapping[int, tuple[Float64, Float64]] = MappingProxyType({})
 

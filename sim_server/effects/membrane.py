@@ -19,9 +19,9 @@ to the nodes.
 The stiffness matrix has blocks of 3x3 between the corners of a triangle. It is the exact tangent where the membrane is
 stretched. Where it is compressed, the negative eigenvalues of d2W/dF2, by which it would wrinkle, are left out, so that
 A stays positive definite; the forces are exact, but Newton-Raphson needs more iterations. There are no wrinkles finer
-than the triangles. Bending is left out: the bending stiffness of a capsule, E t^3 / 12 (1 - nu^2), is far below what the
-elements under it bear, and sums of squared angles between triangles, which keep A positive definite, are right for
-special meshes only.
+than the triangles. Bending is left out: that of a capsule, E t^3 / 12 (1 - nu^2), is far below what the elements under
+it bear, and sums of squared angles between triangles, which keep A positive definite, are right for special meshes
+only. Where a plate is to bend, make it of elements.
 
 Usual ranges: capsule of the liver young 1 to 10 MPa, thickness 0.05 to 0.2 mm; skin 0.1 to 1 MPa, 1 to 2 mm; rubber
 1 MPa, 0.1 to 2 mm; prestretch 1 to 1.3.
@@ -70,9 +70,12 @@ class Params(Parameters):
 class Membrane(Effect):
     """Membranes of all bodies that list the effect.
 
-    elements (m, 4): corners of the triangles, the first again as the fourth, which has no part in anything. gradients (4, m)
-    [1/m], volume (m,) [m3], constants (2, m): as in membrane.cu, whose results are corners (4, m, 9), edges (6, m, 9)
+    elements (m, 4): corners of the triangles, the first again as the fourth, which has no part in anything.
+    gradients (4, m) [1/m], volume (m,) [m3], constants (2, m): as in membrane.cu, whose results are corners (4, m, 9)
+    and edges (6, m, 9)
     """
+
+    holds = False
 
     def __init__(self, world: World, listed: list[tuple[Body, Any]]):
         self.world = world
@@ -127,8 +130,8 @@ class Membrane(Effect):
 
 
 def _flattened(corners: Float64) -> tuple[Float64, Float64]:
-    """Returns areas (m,) [m2] of triangles (m, 3, 3), and rest gradients of corners 1 and 2 in the plane of each, by its
-    edge 01 and across it, (4, m) [1/m]."""
+    """Returns areas (m,) [m2] of triangles (m, 3, 3), and rest gradients of corners 1 and 2 in the plane of each,
+    along its edge 01 and across it, (4, m) [1/m]."""
     first, second = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     base, area = np.linalg.norm(first, axis=1), np.linalg.norm(np.cross(first, second), axis=1) / 2
     along, height = (first * second).sum(axis=1) / base, 2 * area / base

@@ -10,28 +10,28 @@ wound to the other, it is straight. With points p_k, segments l_k long, and t_k 
     bending of a point      E I (|t_k - t_k-1| - c)^2 / (2 m),    I = pi r^4 / 4,    m = (l_k-1 + l_k) / 2
 
 c is |t_k - t_k-1| at rest, so a rod has no force as it is laid, bent or straight, unless it has a `prestretch`: above 1
-it pulls its ends together, as a suture that is tied. Each term is a spring of a weighted sum d of nodes. Forces have
-neither sum nor torque, and enter the matrix with the stiffness of Gauss and Newton, d d^T of the spring, and of what it
-adds across d the part of tension alone. So A stays positive definite, with blocks of 3x3 between the corners of the
-tetrahedra of three points in a row (at most 12); Newton-Raphson needs more iterations where a rod is compressed.
+it pulls its ends together, as a suture that is tied. Of a segment between fixed points m has nothing, since it does not
+bend; so a clamped end is of second order, too. Each term is a spring of a weighted sum d of nodes. Forces have neither
+sum nor torque. In the matrix is the stiffness of Gauss and Newton, along d, and of what tension adds across d the
+positive part. So A stays positive definite, with blocks of 3x3 between the corners of the tetrahedra of three points in
+a row, at most 12; Newton-Raphson needs more iterations where a rod is compressed.
 
 There is no twist: a section turns freely about the axis. So a rod that is curved at rest keeps its curvature, while its
-plane of bending is held by the object alone. Between two of its points a rod bends only as the object's mesh can:
-where the object is not much softer than the rod the bending stiffness of the two is found too large on a mesh that is
-coarse beside the lengths over which it bends. A rod takes no room: the material of the object fills its place, too. It
-does not slide along the object; a `cable` does. `density` adds its mass to the nodes.
+plane of bending is held by the object alone. Between two of its points a rod bends only as the object's mesh can: where
+the object is not much softer than the rod, the two together are too stiff on a mesh that is coarse beside the lengths
+over which they bend. A rod takes no room: the material of the object fills its place, too. It does not slide along the
+object; a `cable` does. `density` adds its mass to the nodes.
 
 Usual ranges: steel 2e11 Pa, nitinol 4e10 to 8e10, polypropylene and nylon sutures 1e9 to 4e9, silk 5e9 to 1e10;
 radius of needles 0.2 to 1 mm, of sutures 0.05 to 0.25 mm; density of steel 7850 kg/m3.
 
 Sources: Bergou, Wardetzky, Robinson, Audoly and Grinspun, Discrete elastic rods, 2008 (discrete curvature; twist and
-the Bishop frame are left out); Bergou, Wardetzky, Harmon, Zorin and Grinspun, A quadratic bending model for
-inextensible surfaces, 2006 (bending of lengths at rest); Goury and Duriez, Fast, generic and reliable control and
-simulation of soft robots using model order reduction, 2018, and Spillmann and Harders, Inextensible elastic rods with
-torsional friction based on Lagrange multipliers, 2010 (rods in tissue).
+its frames are left out); Bergou, Wardetzky, Harmon, Zorin and Grinspun, A quadratic bending model for inextensible
+surfaces, 2006 (bending with lengths at rest).
 """
 
 from collections.abc import Mapping, Sequence
+from itertools import pairwise
 from typing import Annotated, Any, NamedTuple
 
 import numpy as np
@@ -61,7 +61,7 @@ NOTHING = 1e-12  # weight, over the largest one, of a corner that takes no part
 def _points(path: tuple[Any, ...]) -> tuple[Any, ...]:
     if not 2 <= len(path) <= MOST:
         raise complaint(f"has {len(path)} points: must have 2 to {MOST}")
-    if any(a == b for a, b in zip(path, path[1:], strict=False)):
+    if any(a == b for a, b in pairwise(path)):
         raise complaint("has the same point twice in a row")
     return path
 
@@ -91,7 +91,7 @@ class Params(Parameters):
     path: Path | None = Field(default=None, description=ABOUT["path"])
     young: Annotated[Positive | None, STIFFNESS] = Field(default=None, description=ABOUT["young"])
     radius: Positive | None = Field(default=None, description=ABOUT["radius"])
-    prestretch: Annotated[Prestretch | None, Live(0.8, 1.5)] = Field(default=None, description=ABOUT["prestretch"])
+    prestretch: Annotated[Prestretch, Live(0.8, 1.5)] = Field(default=1.0, description=ABOUT["prestretch"])
     density: Positive | None = Field(default=None, description=ABOUT["density"])
     tables: Annotated[Annotated[tuple[Single, ...], BeforeValidator(as_tuple)] | None, Live()] = Field(
         default=None, description="several rods, each { path, young, radius, ... }"
@@ -99,7 +99,7 @@ class Params(Parameters):
 
     @model_validator(mode="after")
     def _one_form(self) -> "Params":
-        given = [key for key in ABOUT if getattr(self, key) is not None]
+        given = [key for key in ("path", "young", "radius", "density") if getattr(self, key) is not None]
         if self.tables is not None and given:
             raise complaint(f"{given[0]}: stands in the tables of the list")
         if not self.tables and None in (self.path, self.young, self.radius):
@@ -115,9 +115,9 @@ class Params(Parameters):
 class Springs(NamedTuple):
     """What a rod is made of, segments and then bends: springs of d, the sum of weights times nodes of the scene.
 
-    nodes, weights: of each, one array for each; over (m,): l_k of segments [m], 1/m of bends inverted, m [m]; length (m,):
-    |d| at rest, of segments [m], of bends [-]; bends (m,): 1 for bends; mass (k,): of the rod's points over its density
-    and A [m], with points (k, 4) and shares (k, 4)
+    nodes, weights: an array for each of the m springs; over (m,): l_k of segments, m of bends [m]; length (m,): |d| at
+    rest, of segments [m], of bends [-]; bends (m,): 1 for bends, else 0; mass (k,): of the rod's points, over its
+    density and A [m]; points (k, 4), shares (k, 4): corners of their tetrahedra, and weights
     """
 
     nodes: list[Int32]
@@ -143,12 +143,12 @@ def course(mesh: Mesh, path: Sequence[Sequence[float]]) -> tuple[Float64, Int32,
     spacing = _edge_length(mesh, given)
     kept = _apart(given, spacing)
     pieces = np.maximum(1, np.round(np.linalg.norm(np.diff(kept, axis=0), axis=1) / spacing)).astype(int)
-    if not len(pieces) or pieces.sum() >= MOST:
+    if pieces.sum() >= MOST:
         raise InputError(
             f"path: would have {pieces.sum() + 1} points, as far apart as edges of the tetrahedra are long there, "
             f"{spacing:.3g} m; must have 2 to {MOST}"
         )
-    parts = [a + (b - a) * np.arange(n)[:, None] / n for a, b, n in zip(kept, kept[1:], pieces, strict=False)]
+    parts = [a + (b - a) * np.arange(n)[:, None] / n for (a, b), n in zip(pairwise(kept), pieces, strict=True)]
     points = np.concatenate([*parts, kept[-1:]])
     corners, weights, inside = contained(points, mesh)
     return points[inside], corners[inside], weights[inside]
@@ -173,7 +173,7 @@ def _apart(path: Float64, spacing: float) -> Float64:
     return np.array([*kept, path[-1]])
 
 
-def springs_of(body: Body, rod: Single | Params) -> Springs:
+def springs_of(world: World, body: Body, rod: Single | Params) -> Springs:
     """Returns what a rod is made of. Raises InputError."""
     assert rod.path is not None
     try:
@@ -182,12 +182,15 @@ def springs_of(body: Body, rod: Single | Params) -> Springs:
         raise InputError(f"object {body.name!r}, effect rod: {error}") from None
     corners = corners + np.int32(body.first)
     length = np.linalg.norm(np.diff(p, axis=0), axis=1)
-    middle = (length[:-1] + length[1:]) / 2
     last = len(p) - 1
+    moves = (np.where(weights > NOTHING, world.free[corners], 0) > 0).any(axis=1)
+    bent = np.where(moves[:-1] | moves[1:], length, 0)
+    middle = (bent[:-1] + bent[1:]) / 2
+    middle[middle == 0] = 1.0  # fixed on both sides
     segments = [_sum(corners, weights, {k: -1.0, k + 1: 1.0}) for k in range(last)]
     bends = [
         _sum(corners, weights, {k - 1: 1 / a, k: -1 / a - 1 / b, k + 1: 1 / b})
-        for k, (a, b) in enumerate(zip(length, length[1:], strict=False), 1)
+        for k, (a, b) in enumerate(pairwise(length), 1)
     ]
     turn = np.linalg.norm(np.diff(np.diff(p, axis=0) / length[:, None], axis=0), axis=1)
     nodes, factors = zip(*segments, *bends, strict=True)
@@ -217,16 +220,20 @@ class Rods(Effect):
     step (rod.cu): tangent (m, 4), nodal_impulse (m, 3)
     """
 
+    holds = False
+
     def __init__(self, world: World, listed: list[tuple[Body, Any]]):
         self.world, self._bodies = world, [body for body, _ in listed]
         rods = [(body, rod) for body, params in listed for rod in params.rods]
-        self._parts = [springs_of(body, rod) for body, rod in rods]
+        self._parts = [springs_of(world, body, rod) for body, rod in rods]
         counts = [len(part.nodes) for part in self._parts]
         self.owner = np.repeat(np.array([body.index for body, _ in rods], np.int64), counts)
         nodes = [each for part in self._parts for each in part.nodes]
         weights = [each for part in self._parts for each in part.weights]
         m, c = len(nodes), max(len(each) for each in nodes)
-        self.elements: Int32 = np.array([np.append(each, np.repeat(each[0], c - len(each))) for each in nodes], np.int32)
+        self.elements: Int32 = np.array(
+            [np.append(each, np.repeat(each[0], c - len(each))) for each in nodes], np.int32
+        )
         self.weights = np.array([np.append(each, np.zeros(c - len(each))) for each in weights])
         self.stiffness = world.follow("rod", compute=lambda scene: self._laws(scene)[0])
         self.length = world.follow("rod", compute=lambda scene: self._laws(scene)[1])
@@ -241,10 +248,9 @@ class Rods(Effect):
         given = [rod for params in params_in(scene, "rod", self._bodies) for rod in params.rods]
         stiffness, length = [], []
         for rod, part in zip(given, self._parts, strict=True):
-            stretch = rod.prestretch or 1.0
-            area, factor = np.pi * rod.radius**2, np.where(part.bends > 0, rod.radius**2 / 4, stretch)
+            area, factor = np.pi * rod.radius**2, np.where(part.bends > 0, rod.radius**2 / 4, rod.prestretch)
             stiffness.append(rod.young * area * factor / part.over)
-            length.append(np.where(part.bends > 0, part.length, part.length / stretch))
+            length.append(np.where(part.bends > 0, part.length, part.length / rod.prestretch))
         return np.concatenate(stiffness), np.concatenate(length)
 
     def unchangeable(self, scene: Scene) -> Mapping[tuple[int, str], str]:

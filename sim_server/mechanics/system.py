@@ -26,7 +26,7 @@ from sim_server.mechanics.world import World
 class Stencil:
     """Places of the elements of an effect in the system.
 
-    An element has c corners, 2 (a spring) or 4 (a tetrahedron).
+    An element has c corners, 2 (a spring), 4 (a tetrahedron), or as many as it couples.
     corner_start (nodes + 1,), corners: slots c e + a of the elements at each node.
     pair_start (blocks above the diagonal + 1,), pairs (k,): c^2 e + c a + b, the corners of e that couple in a block.
 
@@ -51,8 +51,8 @@ Coupled = Int32 | PatchedCells | PatchedTetrahedra
 class System:
     """Pattern and arrays of A' and b' for a world and the elements of its effects.
 
-    elements: per effect, (m, c) node numbers of the elements that couple their corners, c = 2 or 4, or strain cells or
-        tetrahedra and their patches.
+    elements: per effect, (m, c) node numbers of the elements that couple their corners, or strain cells or tetrahedra
+        and their patches.
 
     moving (bodies,): 1 if a node of the body does not rest, so that the step is solved; set by `rotate`
         (kernels/nodes.cu) and cleared by the loop

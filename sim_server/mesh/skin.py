@@ -87,7 +87,7 @@ def embed(points: Float64, mesh: Mesh) -> tuple[Int32, Float64, Float64]:
 
 
 def contained(points: Float64, mesh: Mesh) -> tuple[Int32, Float64, NDArray[np.bool_]]:
-    """Returns nodes (s, 4) and weights (s, 4) of points (s, 3), and which lie in the mesh, (s,); the others have no use."""
+    """Returns nodes (s, 4) and weights (s, 4) of points (s, 3), and which lie in the mesh, (s,)."""
     gradients = _gradients(mesh)
     tet, depth = _deepest(points, mesh, gradients)
     return mesh.tets[tet], _weights(points, tet, mesh, gradients), depth >= -COUNTED * _size(mesh)

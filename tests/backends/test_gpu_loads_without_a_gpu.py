@@ -32,6 +32,11 @@ LOADS: dict[str, tuple[dict[str, Any], set[str]]] = {  # effects of an object, a
     "growth": ({"growth": {"expansion": 1e-3, "amount": 10.0}}, set()),
     "wind": ({"wind": {"velocity": [3, 0, 0]}}, {"wind.faces"}),
     "buoyancy": ({"buoyancy": {"level": 0.3}}, {"buoyancy.wetted", "buoyancy.lift"}),
+    "rod": (
+        {"rod": {"path": [[0.1, 0.1, 0.1], [0.9, 0.15, 0.1]], "young": 1e8, "radius": 0.01, "density": 7850.0}},
+        {"rod.springs", "rod_sums.nodes"},
+    ),
+    "membrane": ({"membrane": {"young": 1e6, "poisson": 0.4, "thickness": 0.01}}, {"membrane.elements"}),
     "target": ({"target": {"to": ["X", "Y + 0.2 * X", "Z"], "stiffness": 1e3}}, {"target.tie"}),
 }  # fmt: skip
 SCHEMES = [("backward_euler", "mixed"), ("ros2", "float64"), ("central_difference", "float32")]

@@ -23,7 +23,12 @@ LOADS: dict[str, Any] = {
         {"where": INSIDE, "pressure": 900.0}, {"where": f"{INSIDE} and X > 0.3", "pressure": 300.0, "lids": True},
     ],
     "growth": {"expansion": [0.01, 0.02, 0]},
+    "membrane": {"young": 1e6, "poisson": 0.4, "thickness": 0.01, "prestretch": 1.1, "density": 1000.0},
     "muscle": {"stress": 1e4, "direction": [1, 2, 0], "period": 0.3, "width": 0.8},
+    "rod": [
+        {"path": [[0.1, 0.1, 0.1], [0.9, 0.1, 0.15]], "young": 1e8, "radius": 0.01, "density": 7850.0},
+        {"path": [[0.1, 0.9, 0.1], [0.9, 0.9, 0.1], [0.9, 0.9, 0.9]], "young": 1e8, "radius": 0.01, "prestretch": 1.1},
+    ],
     "target": {"to": ["X", "Y + 0.1 * X", "Z"], "stiffness": 1e3},
     "traction": {"where": "X > 0.99", "pressure": 200.0},
     "wind": {"velocity": [5, 1, 0], "density": 100.0, "friction": 0.1},
