@@ -183,7 +183,7 @@ def springs_of(world: World, body: Body, rod: Single | Params) -> Springs:
     corners = corners + np.int32(body.first)
     length = np.linalg.norm(np.diff(p, axis=0), axis=1)
     last = len(p) - 1
-    moves = (np.where(weights > NOTHING, world.free[corners], 0) > 0).any(axis=1)
+    moves = np.where(weights > NOTHING, world.free[corners], 0).max(axis=1) > 0
     bent = np.where(moves[:-1] | moves[1:], length, 0)
     middle = (bent[:-1] + bent[1:]) / 2
     middle[middle == 0] = 1.0  # fixed on both sides

@@ -12,6 +12,7 @@ from sim_server.simulation import Simulation
 from sim_server.updates.driver import Driver
 from tests.effects.hollow import hollow, loaded, sphere
 from tests.scenes import bar, rotation, scene
+from tests.texts import module_in
 
 YOUNG, THICKNESS = 1e5, 1e-3
 TOP = {"young": YOUNG, "thickness": THICKNESS, "where": "Z > 0.999"}
@@ -108,6 +109,24 @@ def test_the_tangent_is_never_indefinite(cover):
         matrix = tangent(cover)
         assert np.isfinite(cover.system.b).all()
         assert np.linalg.eigvalsh(matrix).min() > -1e-12 * np.abs(matrix).max()
+
+
+@pytest.mark.parametrize("size", [0.0, 0.3])
+def test_single_precision_agrees(cover, size):
+    """As a GPU has it; at rest stretches are equal and eigenvalues zero."""
+    effect: Any = cover.effects["membrane"]
+    x, m = cover.world.rest + size * np.random.default_rng(3).normal(size=cover.world.rest.shape), len(effect.elements)
+    found = []
+    for real, dtype in (("float", "f4"), ("double", "f8")):
+        arrays = {"x": x, "v": 0 * x, "gradients": effect.gradients, "volume": effect.volume,
+                  "constants": effect.constants, "stiffness_coefficient": np.ones(m)}  # fmt: skip
+        given = {name: array.astype(dtype) for name, array in arrays.items()}
+        out = {"corners": np.zeros((4, m, 9), dtype), "edges": np.zeros((6, m, 9), dtype)}
+        module_in("effects/membrane.cu", real).bind("elements", m, corner=effect.elements, h=1.0, **given, **out)()
+        found.append(out)
+    for name in out:
+        bound = 1e-5 * np.abs(found[1]["edges"]).max()
+        assert np.abs(found[0][name] - found[1][name]).max() < bound, name
 
 
 def test_a_rigid_motion_makes_no_force(cover):

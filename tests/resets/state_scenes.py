@@ -64,6 +64,8 @@ LOADS = {
     "cable": [
         {"path": [[0, 0, 0], [0.4, 0, 0]], "tension": 5.0}, {"path": [[0, 0.1, 0], [0.4, 0.1, 0]], "stiffness": 1e3},
     ],
+    "rod": {"path": [[0, 0.04, 0.05], [0.4, 0.05, 0.05]], "young": 1e8, "radius": 2e-3, "density": 7850.0},
+    "membrane": {"young": 1e6, "poisson": 0.4, "thickness": 1e-3, "prestretch": 1.05},
 }  # fmt: skip
 SCENES: dict[str, dict[str, Any]] = {
     "laws": table([beam(tangent="exact"), MIXED]),
