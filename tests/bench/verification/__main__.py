@@ -9,7 +9,18 @@ from typing import Annotated, Any
 import typer
 
 from tests.bench.harness.report import Report, plots
-from tests.bench.verification import actuation, bending, laws, locking, memory, motion, nafems, static, structures
+from tests.bench.verification import (
+    actuation,
+    bending,
+    laws,
+    locking,
+    memory,
+    motion,
+    nafems,
+    pores,
+    static,
+    structures,
+)
 from tests.bench.verification.row import Row
 
 ABOUT = """\
@@ -38,7 +49,7 @@ STATIC: list[tuple[str, Callable[[list[int]], tuple[list[Row], static.Curves]], 
 OTHERS = [
     laws.slopes, laws.patch, laws.uniaxial, motion.time_orders, motion.momentum, motion.energies,
     motion.preconditioners, *bending.CASES, nafems.stresses, memory.viscoelasticity, memory.plasticity,
-    *actuation.CASES, *structures.CASES,
+    pores.poroelasticity, *actuation.CASES, *structures.CASES,
 ]  # fmt: skip
 LOCKING = """\
 Sag of a clamped bar of 1 x 1 x 4 m under a small weight over what it should be, by Poisson's ratio: the mean of the
