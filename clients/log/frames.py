@@ -91,7 +91,7 @@ def _cut(uncut: Mesh, message: pb.Topology, name: str) -> Mesh:
     if skin is not None:
         corners = array(message.skin_triangles, np.int32, (-1, 3), f"{name}: skin_triangles")
         check_range(corners, 0, len(skin.nodes), f"{name}: skin_triangles")
-        skin = _with_faces(replace(skin, triangles=corners), _bare(uncut.triangles, triangles))
+        skin = _with_faces(replace(skin, triangles=corners), _bare(uncut.tets[removed], triangles))
     elastic = there if len(uncut.young) else slice(0)
     return replace(
         uncut, epoch=message.header.epoch + message.cut, tets=uncut.tets[there], triangles=triangles, skin=skin,
@@ -99,12 +99,12 @@ def _cut(uncut: Mesh, message: pb.Topology, name: str) -> Mesh:
     )  # fmt: skip
 
 
-def _bare(before: NDArray[np.int32], now: NDArray[np.int32]) -> NDArray[np.int32]:
-    """Returns the triangles of a surface that are not those of the one before, (t, 3)."""
-    rows = np.sort(np.concatenate([before, now]), axis=1)
-    _, number = np.unique(rows, axis=0, return_inverse=True)
+def _bare(removed: NDArray[np.int32], triangles: NDArray[np.int32]) -> NDArray[np.int32]:
+    """Returns the triangles of a surface that were faces of removed elements (r, 4) as well, (t, 3)."""
+    faces = removed[:, [[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]]].reshape(-1, 3)
+    _, number = np.unique(np.sort(np.concatenate([faces, triangles]), axis=1), axis=0, return_inverse=True)
     number = number.reshape(-1)
-    return now[~np.isin(number[len(before) :], number[: len(before)])]
+    return triangles[np.isin(number[len(faces) :], number[: len(faces)])]
 
 
 def _with_faces(skin: Skin, faces: NDArray[np.int32]) -> Skin:
