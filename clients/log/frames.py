@@ -111,10 +111,10 @@ def _with_faces(skin: Skin, faces: NDArray[np.int32]) -> Skin:
     """Returns a skin with faces of elements beside it, which a cut has laid bare; their nodes are further vertices."""
     nodes, corner = np.unique(faces, return_inverse=True)
     weights = np.tile([1.0, 0, 0, 0], (len(nodes), 1))
-    corner = corner.reshape(-1, 3).astype(np.int32) + len(skin.nodes)
+    places = corner.reshape(-1, 3).astype(np.int32) + len(skin.nodes)
     return Skin(
         np.concatenate([skin.nodes, np.repeat(nodes[:, None], 4, axis=1).astype(np.int32)]),
-        np.concatenate([skin.weights, weights]), np.concatenate([skin.triangles, corner]),
+        np.concatenate([skin.weights, weights]), np.concatenate([skin.triangles, places]),
     )  # fmt: skip
 
 

@@ -272,7 +272,10 @@ class Telemetry:
     def _record_frame(self, step: int, x: Float64, v: Float64, poses: Float64 | None = None) -> None:
         assert self.recorder is not None
         for body in self.simulation.world.bodies:
-            self.recorder.state(self._state(body, step, x, v), block=self.patient)
+            if self.cuts.written(body.name):
+                self.recorder.state(self._state(body, step, x, v), block=self.patient)
+            else:
+                self.recorder.skip_frame()
         self.contact.record_poses(step, poses, block=self.patient)
 
     def _on_set(self, update: ParameterUpdate) -> None:
