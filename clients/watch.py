@@ -43,7 +43,8 @@ def tables(status: pb.Status) -> Group:
     local = [_local(status)] if status.local_workers else []
     pace = [Text(status.pace, "bold red")] if status.pace else []
     return Group(
-        _summary(status), *pace, _objects(status), *_errors(status), *_contacts(status), *_energies(status),
+        _summary(status), *pace, _objects(status), *_errors(status), *_contacts(status), *_readings(status),
+        *_energies(status),
         _workers(status), *local,
     )  # fmt: skip
 
@@ -124,6 +125,18 @@ def _contacts(status: pb.Status) -> list[Table]:
         p, w = pose.position, min(abs(pose.rotation.w), 1.0)
         _add(where, pose.header.object, f"{p.x:.3g} {p.y:.3g} {p.z:.3g}", f"{math.degrees(2 * math.acos(w)):.3g}")
     return [table, where] if status.obstacles else [table]
+
+
+def _readings(status: pb.Status) -> list[Table]:
+    """Table of what effects tell of the objects: pressures, tensions; empty where none does."""
+    table = Table("object", "of", "in the last step", **COMPACT)
+    for found in status.objects:
+        of: dict[str, list[str]] = {}
+        for r in found.last.readings:
+            of.setdefault(r.of, []).append(f"{r.quantity} {r.value:.4g} {r.unit}")
+        for name, told in of.items():
+            _add(table, found.object, name, ", ".join(told))
+    return [table] if table.row_count else []
 
 
 def _energies(status: pb.Status) -> list[Table]:

@@ -12,6 +12,7 @@ record  service/telemetry.py fetches those of the engine (`records`) for recordi
 """
 
 from collections.abc import Callable, Sequence
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
@@ -22,6 +23,7 @@ from sim_server import backends
 from sim_server.backends.base import Backend, Capability, EngineInput, Launch, PendingUpdate
 from sim_server.backends.compiler import ahead
 from sim_server.backends.kinds import FACTOR_TRUST, WARPED_TRUST, Kind
+from sim_server.backends.measured import Measured
 from sim_server.backends.rank_one import RankOne
 from sim_server.effects import effect
 from sim_server.effects._base import Effect, Refusal
@@ -138,7 +140,7 @@ class Simulation:
         return EngineInput(
             assemble, integrate, names, ranges, w.dt, self.scene.solver, self.energies, newton, stages, euler, substeps,
             contact, touch, held, self.scene.accuracy is not None, self._rank_one(), arrays, history,
-            self.cutting.cut_input() if self.cutting else None,
+            self.cutting.cut_input() if self.cutting else None, self.measured,
         )  # fmt: skip
 
     def _rank_one(self) -> RankOne | None:
@@ -301,6 +303,11 @@ class Simulation:
         """Names of what objects exert forces on, in the order of the engine's reactions."""
         w = self.world
         return [*self.posed_names, *(a.name for a in w.attachments), *(s.name for s in w.springs)]
+
+    @cached_property
+    def measured(self) -> list[Measured]:
+        """Numbers that the records of steps come with, in the order of bodies."""
+        return sorted((m for e in self.effects.values() for m in e.measured()), key=lambda m: m.body)
 
     def rotated_bodies(self) -> list[Body]:
         """Bodies whose rotations for the warp are those of elements."""

@@ -91,11 +91,30 @@ def _cut(uncut: Mesh, message: pb.Topology, name: str) -> Mesh:
     if skin is not None:
         corners = array(message.skin_triangles, np.int32, (-1, 3), f"{name}: skin_triangles")
         check_range(corners, 0, len(skin.nodes), f"{name}: skin_triangles")
-        skin = replace(skin, triangles=corners)
+        skin = _with_faces(replace(skin, triangles=corners), _bare(uncut.tets[removed], triangles))
     elastic = there if len(uncut.young) else slice(0)
     return replace(
         uncut, epoch=message.header.epoch + message.cut, tets=uncut.tets[there], triangles=triangles, skin=skin,
         uncut=uncut, young=uncut.young[elastic], poisson=uncut.poisson[elastic],
+    )  # fmt: skip
+
+
+def _bare(removed: NDArray[np.int32], triangles: NDArray[np.int32]) -> NDArray[np.int32]:
+    """Returns the triangles of a surface that were faces of removed elements (r, 4) as well, (t, 3)."""
+    faces = removed[:, [[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]]].reshape(-1, 3)
+    _, number = np.unique(np.sort(np.concatenate([faces, triangles]), axis=1), axis=0, return_inverse=True)
+    number = number.reshape(-1)
+    return triangles[np.isin(number[len(faces) :], number[: len(faces)])]
+
+
+def _with_faces(skin: Skin, faces: NDArray[np.int32]) -> Skin:
+    """Returns a skin with faces of elements beside it, which a cut has laid bare; their nodes are further vertices."""
+    nodes, corner = np.unique(faces, return_inverse=True)
+    weights = np.tile([1.0, 0, 0, 0], (len(nodes), 1))
+    places = corner.reshape(-1, 3).astype(np.int32) + len(skin.nodes)
+    return Skin(
+        np.concatenate([skin.nodes, np.repeat(nodes[:, None], 4, axis=1).astype(np.int32)]),
+        np.concatenate([skin.weights, weights]), np.concatenate([skin.triangles, places]),
     )  # fmt: skip
 
 

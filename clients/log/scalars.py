@@ -21,6 +21,9 @@ REACTIONS = ("force_x", "force_y", "force_z", "torque_x", "torque_y", "torque_z"
 """Of what the object exerts on WHAT (`reaction_name`); the point only where the torque is about one of its own."""
 
 
+READING = "reading/"  # columns reading/WHAT/QUANTITY: reading/cavity/pressure [Pa], reading/cable[1]/tension [N]
+
+
 def _dtype(field: Any) -> str:
     if field.type == FieldDescriptor.TYPE_DOUBLE:
         return "f8"
@@ -48,9 +51,10 @@ def enum_name(field: str, value: int) -> str:
 
 
 def row(message: pb.ObjectStep) -> tuple:
-    """Returns the values of one step in the order of DTYPES, and then its reactions by what they are on."""
+    """Returns the values of one step in the order of DTYPES, its reactions by what they are on, and its readings."""
     reactions = {reaction_name(r): _reaction(r) for r in message.reactions}
-    return *(_value(message, name) for name in DTYPES), reactions
+    readings = {f"{READING}{r.of}/{r.quantity}": r.value for r in message.readings}
+    return *(_value(message, name) for name in DTYPES), reactions, readings
 
 
 def reaction_name(message: pb.Reaction) -> str:
@@ -75,11 +79,13 @@ def _value(message: pb.ObjectStep, name: str) -> object:
 
 def columns(rows: Iterable[tuple]) -> Columns:
     """Returns one array per scalar, ascending in step."""
-    *table, reactions = list(zip(*sorted(rows, key=lambda r: r[0]), strict=True)) or [()] * (len(DTYPES) + 1)
+    *table, reactions, readings = list(zip(*sorted(rows, key=lambda r: r[0]), strict=True)) or [()] * (len(DTYPES) + 2)
     found = {name: np.array(values, dtype) for (name, dtype), values in zip(DTYPES.items(), table, strict=True)}
     for what in sorted(set().union(*reactions)):
         width = max(len(each.get(what, ())) for each in reactions)
         none = (0.0,) * 6 + (math.nan,) * (width - 6)
         values = np.array([each.get(what, none) for each in reactions])
         found |= {f"{REACTION}{what}/{name}": values[:, k] for k, name in enumerate(REACTIONS[:width])}
+    for name in dict.fromkeys(name for each in readings for name in each):
+        found[name] = np.array([each.get(name, math.nan) for each in readings])
     return found

@@ -2,7 +2,8 @@
 """Meshes and scalars of a run as rerun entities.
 
 /world/OBJECT holds the surface, /world/OBSTACLE too, /plots/QUANTITY/OBJECT a curve, /plots/energy/KIND/OBJECT and
-/plots/estimate/KIND/OBJECT curves of energies and estimated errors; timelines are `step` and `time` (simulated).
+/plots/estimate/KIND/OBJECT curves of energies and estimated errors, /plots/reading/QUANTITY/WHAT of OBJECT curves of
+what effects tell, as the pressure of a cavity; timelines are `step` and `time` (simulated).
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from numpy.typing import NDArray
 
 from clients.log.frames import Frame, Mesh
 from clients.log.obstacles import Obstacle, ObstacleFrame, Pose
-from clients.log.scalars import REACTION, Columns
+from clients.log.scalars import REACTION, READING, Columns
 from clients.viewer.colors import colors
 from clients.viewer.obstacle_surface import COLOR, obstacle_surface
 from clients.viewer.surface import Coloring, Surface, legend
@@ -46,6 +47,7 @@ class RerunScene:
         self._shown: dict[str, int] = {}  # object -> epoch whose triangles were logged last
         self._top, self._grow = top, grow
         self._has_contact = False
+        self._quantities: dict[str, None] = {}  # of readings
         self._low = np.full(3, np.inf)
         self._high = np.full(3, -np.inf)
         recording.log("world", rr.ViewCoordinates.RIGHT_HAND_Y_UP, static=True)
@@ -57,6 +59,11 @@ class RerunScene:
         if key not in self._surfaces:
             self._surfaces[key] = Surface(mesh, self._coloring)
         return self._surfaces[key]
+
+    @property
+    def quantities(self) -> int:
+        """Number of the quantities that effects have told so far, each with a plot of its own."""
+        return len(self._quantities)
 
     def frame(self, frame: Frame, mesh: Mesh) -> bool:
         """Logs positions, normals and colours, and new triangles. Returns False for NaN, which is not shown."""
@@ -116,6 +123,11 @@ class RerunScene:
             values = scalars[energy]
             self._curve(f"energy/{energy.removesuffix('_energy')}", name, scalars, values, np.isfinite(values))
         self._contact(name, scalars)
+        for column in (each for each in scalars if each.startswith(READING)):
+            of, quantity = column.removeprefix(READING).rsplit("/", 1)
+            self._quantities[quantity] = None
+            known = np.isfinite(scalars[column])
+            self._curve(f"reading/{quantity}", f"{of} of {name}", scalars, scalars[column], known)
         if step_time:
             self._curve("step_time", "all", scalars, scalars["step_seconds"] * 1e3, np.ones(len(age), bool))
 
@@ -134,6 +146,7 @@ class RerunScene:
             row_shares=[8, 1],
         )
         plotted = PLOTS | CONTACT_PLOTS if self._has_contact else PLOTS
+        plotted = plotted | {f"reading/{quantity}": f"{quantity} [SI unit]" for quantity in self._quantities}
         plots = rrb.Vertical(
             *(rrb.TimeSeriesView(origin=f"/plots/{quantity}", name=title) for quantity, title in plotted.items())
         )

@@ -155,7 +155,7 @@ def follow(client: Client, scene: RerunScene, viewer: Viewer, recording: rr.Reco
     meshes, obstacles = client.meshes(), client.obstacles()
     states, steps, poses = client.states(), client.steps(), client.poses()
     first = min(meshes, default="")
-    laid_out = False
+    laid_out = -1  # quantities that the layout has
     while viewer.running():
         frames = states.newest()
         for frame in frames:
@@ -170,11 +170,11 @@ def follow(client: Client, scene: RerunScene, viewer: Viewer, recording: rr.Reco
             by_object.setdefault(step.header.object, []).append(row(step))
         for name, rows in by_object.items():
             scene.steps(name, columns(rows), step_time=name == first)
-        if frames and not laid_out:
-            for obstacle in obstacles.values():
+        if frames and laid_out < scene.quantities:
+            for obstacle in obstacles.values() if laid_out < 0 else ():
                 scene.obstacle(obstacle)
             recording.send_blueprint(scene.blueprint())
-            laid_out = True
+            laid_out = scene.quantities
         for pose in poses.newest():
             scene.pose(pose)
         time.sleep(LIVE_PERIOD)

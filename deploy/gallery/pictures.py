@@ -1,15 +1,19 @@
 # SPDX-License-Identifier: MIT
 """Makes the pictures of docs/gallery.md: python -m deploy.gallery.pictures [NAME...] writes docs/figures/gallery.
 
-Each scene runs in real time while a client drags a body; the picture is that of the last step, drawn by the processor.
+Each scene of the gallery runs in real time while a client drags a body; those that show an effect run by themselves,
+but for the liver, which a client pushes and cuts. The picture is that of the last step, drawn by the processor.
 """
 
 import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -22,6 +26,7 @@ FOLDER = Path(__file__).resolve().parents[2] / "docs" / "figures" / "gallery"
 SIZE = (420, 360)  # pixels
 GRAB_AT, STEPS = 60, 110
 Vector = tuple[float, float, float]
+Act = Callable[[Client, "subprocess.Popen[bytes]"], None]
 
 
 @dataclass(frozen=True)
@@ -47,6 +52,41 @@ DRAGS = {
 }
 
 
+@dataclass(frozen=True)
+class Effect:
+    """How a scene of deploy/scenes that shows an effect is shown: after so many steps."""
+
+    scene: str
+    steps: int
+    angle: Angle = FRONT
+
+
+EFFECTS = {
+    "beating_strip": Effect("beating_strip", 130, Angle(25, 12, 1.2)),
+    "needle": Effect("needle", 90, Angle(30, 16, 1.0)),
+    "soft_gripper": Effect("soft_gripper", 60, Angle(20, 14, 1.2)),
+    "tendon_finger": Effect("tendon_finger", 150, Angle(25, 12, 1.2)),
+    "torn_sheet": Effect("torn_sheet", 120, Angle(20, 8, 0.95)),
+}
+# What docs/gallery.md has a client do with the liver, by step: sim-client push, and sim-client cut.
+PUSH_AT, CUT_AT, CUT_STEPS = 60, 75, 90
+CUT = "liver_cut"
+PUSH: dict[str, Any] = {"at": (0.12, 0.01, 0.01), "force": (0, 5, -2), "radius": 0.03, "duration": 5.0}
+BLADE = [(-0.03, -0.1, 0.12), (-0.03, 0.03, 0.12), (-0.03, 0.03, 0.0), (-0.03, -0.1, 0.0)]  # corners [m]
+
+
+def push_and_cut(client: Client, server: "subprocess.Popen[bytes]") -> None:
+    """Pushes a lobe of the liver, and then cuts into the other one."""
+    states, pushed, cut = client.states(["liver"]), False, False
+    while server.poll() is None:
+        time.sleep(0.01)
+        for frame in states.newest():
+            if frame.step >= PUSH_AT and not pushed:
+                pushed = bool(client.push("liver", **PUSH))
+            if frame.step >= CUT_AT and not cut:
+                cut = bool(client.cut("liver", blade=BLADE))
+
+
 def play(client: Client, server: "subprocess.Popen[bytes]", drag: Drag) -> None:
     """Grabs a body and moves the grab evenly until the server has made its steps."""
     node = int(np.linalg.norm(client.meshes()[drag.object].rest - drag.at, axis=1).argmin())
@@ -66,16 +106,33 @@ def play(client: Client, server: "subprocess.Popen[bytes]", drag: Drag) -> None:
 
 def picture(name: str) -> None:
     """Runs a scene and writes its picture."""
+    if name in DRAGS:
+        act: Act = partial(play, drag=DRAGS[name])
+        run(name, f"gallery/{name}", STEPS, DRAGS[name].angle, act)
+    elif name == CUT:
+        run(name, "gallery/liver", CUT_STEPS, Angle(20, 8, 1.3), push_and_cut)
+    else:
+        shown = EFFECTS[name]
+        run(name, f"deploy/scenes/{shown.scene}.toml", shown.steps, shown.angle, watched)
+
+
+def watched(client: Client, server: "subprocess.Popen[bytes]") -> None:
+    """Does nothing with a scene until the server has made its steps."""
+    server.wait()
+
+
+def run(name: str, scene: str, steps: int, angle: Angle, act: Act) -> None:
+    """Runs a scene while `act` does something with it, and writes its picture."""
     with tempfile.TemporaryDirectory() as folder:
         log = Path(folder) / f"{name}.mcap"
-        server = start(f"gallery/{name}", "--record", str(log), "--quiet", "--steps", str(STEPS))
+        server = start(scene, "--record", str(log), "--quiet", "--steps", str(steps))
         try:
             with connected(server) as client:
-                play(client, server, DRAGS[name])
+                act(client, server)
         finally:
             ended(server)
         with Log(log) as opened:
-            stage = Stage(opened, SIZE, DRAGS[name].angle)
+            stage = Stage(opened, SIZE, angle)
             drawn = stage.draw(stage.end, caption=False)
     drawn.save(FOLDER / f"{name}.png", optimize=True)
 
@@ -83,7 +140,7 @@ def picture(name: str) -> None:
 def main(names: list[str]) -> None:
     """Makes the pictures of these names, or all."""
     FOLDER.mkdir(parents=True, exist_ok=True)
-    for name in names or list(DRAGS):
+    for name in names or [*DRAGS, CUT, *EFFECTS]:
         picture(name)
         print(f"{name}: {(FOLDER / f'{name}.png').stat().st_size / 1e3:.0f} kB", flush=True)
 

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from sim_server.backends.contact import Contact
     from sim_server.backends.energies import Energies
     from sim_server.backends.euler_form import EulerForm
+    from sim_server.backends.measured import Measured
     from sim_server.backends.newton import Newton
     from sim_server.backends.rank_one import RankOne
     from sim_server.backends.rosenbrock import Rosenbrock
@@ -155,11 +156,13 @@ class Engine(Protocol):
     loop: memory shared with the running loop
     frame_poses: of the frames returned last, by step: position [m] and quaternion w, x, y, z of each obstacle
         (obstacles, 7)
+    readings: of the records returned last, the numbers of `measured` of the body of each, (k, most of a body)
     begin: launches that make the state before the first step; set before it
     """
 
     loop: LoopState
     frame_poses: dict[int, Float64]
+    readings: Float64
     begin: Sequence[Launch]
 
     @property
@@ -339,6 +342,7 @@ class EngineInput:
     arrays: of the system by name: row_start, columns, values, b, y, x, v, clock, moving, rotation
     history: launches that begin every step, once, whatever attempts, trials or stages it takes
     cut: of bodies that may lose elements; None: no object lists the effect
+    measured: numbers that records come with, in the order of bodies
     """
 
     assemble: Sequence[Launch]
@@ -360,6 +364,7 @@ class EngineInput:
     arrays: Mapping[str, NDArray[Any]]
     history: Sequence[Launch] = ()
     cut: CutInput | None = None
+    measured: Sequence[Measured] = ()
 
 
 @dataclass(frozen=True)

@@ -1,12 +1,15 @@
 # SPDX-License-Identifier: MIT
 """What a loop reports, as another thread reads it: step records and frames, oldest first."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from sim_server.arrays import Int32
 from sim_server.backends.cpu.structs import REACTION, RECORD
+from sim_server.backends.measured import Measured, first_of_bodies
 
 Reals = NDArray[np.float64]
 OTHERS = 1 << 15  # reactions on grabs and other bodies that may wait to be read
@@ -19,6 +22,7 @@ class Reports:
     type that the device has them in.
 
     frame_poses: of the frames returned last, by step: position [m] and quaternion of each obstacle (obstacles, 7)
+    readings: of the records returned last, the numbers that effects leave of the body of each (measured.py), (k, most)
     """
 
     records_dtype = RECORD
@@ -33,6 +37,7 @@ class Reports:
         loop.frames, loop.frame_steps = self._frames.ctypes.data, self._frame_steps.ctypes.data
         loop.frame_capacity = len(frames)
         self._reactions = np.zeros((len(self._records), 0, 6))
+        self._readings, self.readings = np.zeros((len(self._records), 0)), np.zeros((0, 0))
         self._others = np.zeros(OTHERS, REACTION)
         loop.others, loop.other_capacity = self._others.ctypes.data, OTHERS
         self._frame_poses = np.zeros((len(frames), 0, 7))
@@ -54,6 +59,14 @@ class Reports:
         self._frame_poses = np.zeros((len(self._frames), obstacles, 7)) if poses is None else poses
         self.loop.frame_poses = self._frame_poses.ctypes.data
 
+    def report_readings(self, measured: Sequence[Measured], bodies: int) -> Int32:
+        """Has records come with the numbers of their bodies. Returns the place of the first one of each body."""
+        first = first_of_bodies(measured, bodies)
+        most = int(np.diff(first).max())
+        self._readings = np.zeros((len(self._records), most))
+        self.loop.readings, self.loop.most_readings = self._readings.ctypes.data, most
+        return first
+
     def records(self) -> NDArray[Any]:
         """New records since the last call, oldest first, (k,) of RECORD."""
         return self.records_and_reactions()[0]
@@ -64,6 +77,7 @@ class Reports:
         head, tail, size = int(self.loop.record_head), int(self.loop.record_tail), len(self._records)
         slots = np.arange(tail, head) % size
         out = self._records[slots], self._reactions[slots]
+        self.readings = self._readings[slots]
         self.loop.record_tail = head
         if head > tail:
             self._reported = int(out[0]["step"][-1])

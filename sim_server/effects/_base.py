@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from sim_server.arrays import Float64, Int32
 from sim_server.backends.base import Launch, PendingUpdate
 from sim_server.backends.energies import ElementEnergies
+from sim_server.backends.measured import Measured
 from sim_server.backends.rank_one import RankOne
 from sim_server.mechanics.system import Coupled, Stencil, System
 from sim_server.mechanics.world import Body, World
@@ -169,6 +170,10 @@ class Effect:
             elements.launch()
             total += float(elements.launch.fetch("energy").sum(dtype=float))
         return total
+
+    def measured(self) -> list[Measured]:
+        """Numbers that its kernels leave in each step for the records, the log and clients, by body; [] for most."""
+        return []
 
     def refusals(self) -> list[Refusal]:
         """Elements whose deformation the law does not define (e.g. J <= 0), by the time of the first occurrence.

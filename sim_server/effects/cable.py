@@ -36,6 +36,7 @@ from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 from sim_server.arrays import Float64, Int32
 from sim_server.backends.base import Launch
 from sim_server.backends.energies import ElementEnergies
+from sim_server.backends.measured import Measured, columns
 from sim_server.effects._base import params_in
 from sim_server.effects._loads import LoadingEffect
 from sim_server.errors import InputError
@@ -254,6 +255,12 @@ class Cables(LoadingEffect):
             energy=self._energy,
         )  # fmt: skip
         return ElementEnergies(launch, self._energy, self._owner)
+
+    def measured(self) -> list[Measured]:
+        """Tension and length of each cable."""
+        owners: list[int] = self._owner.tolist()
+        listed = [self.world.bodies[owner].effects["cable"].tables is not None for owner in owners]
+        return columns(self.state, owners, "cable", listed, (("tension", "N"), ("length", "m")))
 
     def readings(self) -> list[Reading]:
         """Tension and length of each cable in the last evaluation, in the order of the scene."""

@@ -43,6 +43,7 @@ from pydantic import BeforeValidator, Field, model_validator
 from sim_server.arrays import Float64, Int32
 from sim_server.backends.base import Launch
 from sim_server.backends.energies import ElementEnergies
+from sim_server.backends.measured import Measured, columns
 from sim_server.backends.rank_one import RankOne
 from sim_server.effects._base import Effect, params_in
 from sim_server.effects._loads import LoadingEffect
@@ -350,6 +351,12 @@ class Cavities(LoadingEffect):
     @cached_property
     def _owner(self) -> Any:
         return np.array([wall.body.index for wall in self.walls], np.int64)
+
+    def measured(self) -> list[Measured]:
+        """Volume and pressure of each cavity."""
+        listed = [wall.body.effects["cavity"].tables is not None for wall in self.walls]
+        owners = [wall.body.index for wall in self.walls]
+        return columns(self.state, owners, "cavity", listed, (("volume", "m3"), ("pressure", "Pa")))
 
     def readings(self) -> list[Reading]:
         """Pressure and volume of each cavity in the last evaluation, in the order of the scene."""

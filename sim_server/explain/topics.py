@@ -74,8 +74,9 @@ class NotedRecorder(Recorder):
         self.dropped = self.lost = self.written = self._time = 0
         self.failure = ""
 
-    def _append(self, topic: str, *_: object) -> None:
+    def _append(self, topic: str, *_: object, **__: object) -> bool:
         self.found.add(topic)
+        return True
 
 
 def topics(simulation: Simulation, server: str) -> dict[str, Topics]:

@@ -15,12 +15,13 @@ from protocol.method import Method
 from protocol.process.version import version
 from sim_server.arrays import Float64
 from sim_server.backends.kinds import Kind
+from sim_server.backends.measured import Measured
 from sim_server.mechanics.named_points import NamedPoints
 from sim_server.mechanics.world import Body
 from sim_server.mesh import posed
 from sim_server.mesh.surface import surface_triangles
 from sim_server.parameters import LiveParameter, ParameterUpdate
-from sim_server.recording.object_steps import Reactions, object_step, rows
+from sim_server.recording.object_steps import Reactions, Readings, object_step, rows
 from sim_server.scene.solver_options import FACTORS
 from sim_server.simulation import Simulation
 from sim_server.state import code
@@ -138,11 +139,11 @@ def parameter_set(step: int, update: ParameterUpdate) -> pb.ParameterSet:
 
 def steps(
     simulation: Simulation, records: NDArray[Any], methods: Callable[[int, int], Method | None] | None = None,
-    reactions: Reactions | None = None,
+    reactions: Reactions | None = None, readings: Readings | None = None,
 ) -> list[pb.ObjectStep]:  # fmt: skip
     """Step records (structs.RECORD) as messages.
 
-    methods: of body and step, how that factor was made ("auto"). reactions: of the same records
+    methods: of body and step, how that factor was made ("auto"). reactions, readings: of the same records
     """
     names = [b.name for b in simulation.world.bodies]
     kinds = preconditioner_names(simulation)
@@ -155,6 +156,8 @@ def steps(
     ]
     if reactions is not None:
         reactions.add_to(found)
+    if readings is not None:
+        readings.add_to(found)
     return found
 
 
@@ -162,6 +165,15 @@ def reactions(simulation: Simulation, on_obstacles: Float64, others: NDArray[Any
     """What objects exerted in the steps of records, as an engine tells it."""
     obstacles = simulation.reaction_names if on_obstacles.shape[1] else []
     return Reactions(on_obstacles, others, obstacles, [b.name for b in simulation.world.bodies])
+
+
+def readings(simulation: Simulation, values: Float64) -> Readings:
+    """What effects tell of objects in the steps of records, as an engine tells it."""
+    bodies = simulation.world.bodies
+    measured: dict[str, list[Measured]] = {}
+    for each in simulation.measured:
+        measured.setdefault(bodies[each.body].name, []).append(each)
+    return Readings(values, measured)
 
 
 def preconditioner_names(simulation: Simulation) -> dict[Kind, str]:

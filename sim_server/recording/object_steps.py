@@ -5,7 +5,7 @@ A column of struct Record (backends/cpu/native/ring_buffers.h) is the field of t
 column without a field is not sent. NaN leaves an `optional` field unset.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,6 +16,7 @@ from protocol import messages_pb2 as pb
 from sim_server.arrays import Float64
 from sim_server.backends.cpu.structs import REACTION_KINDS, RECORD
 from sim_server.backends.kinds import Kind
+from sim_server.backends.measured import Measured
 
 FIELDS = {  # of ObjectStep by column, where names differ
     "assemble": "assemble_seconds",
@@ -84,6 +85,29 @@ class Reactions:
         for name in ("force", "torque", "point"):
             x, y, z = other[name].tolist()
             getattr(message, name).CopyFrom(pb.Vector(x=x, y=y, z=z))
+
+
+@dataclass(frozen=True)
+class Readings:
+    """What effects tell of objects in the steps of some records.
+
+    values: (records, most of an object); measured: by object, of its values
+    """
+
+    values: Float64
+    measured: Mapping[str, Sequence[Measured]]
+
+    def __getitem__(self, of: Any) -> "Readings":
+        """Returns the same of some of the records. of: a slice, or numbers of records."""
+        return Readings(self.values[of], self.measured)
+
+    def add_to(self, steps: Sequence[pb.ObjectStep]) -> None:
+        """Adds them to the steps of the records."""
+        if not self.measured:
+            return
+        for step, values in zip(steps, self.values.tolist(), strict=True):
+            for m, value in zip(self.measured.get(step.header.object, ()), values, strict=False):
+                step.readings.add(of=m.of, quantity=m.quantity, unit=m.unit, value=value)
 
 
 def rows(records: NDArray[Any]) -> list[dict[str, Any]]:

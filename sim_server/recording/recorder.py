@@ -86,10 +86,16 @@ class Recorder:
     def scene(self, message: pb.Scene, block: bool = False) -> None:
         self._append("/scene", message, 0, 0, block)
 
-    def topology(self, message: pb.Topology, block: bool = False, time: float | None = None) -> None:
-        """Appends a mesh, or what a cut changes of it. time: from which it holds [s of simulation]; None: now."""
+    def topology(
+        self, message: pb.Topology, block: bool = False, time: float | None = None, again: bool = False
+    ) -> bool:  # fmt: skip
+        """Appends a mesh, or what a cut changes of it. time: from which it holds [s of simulation]; None: now.
+
+        Returns False if there is no room for it. again: the caller sends it again then, so that it is not lost
+        """
         stamp = self._time if time is None else self._stamp(time)
-        self._append(f"/topology/{message.header.object}", message, stamp, message.header.epoch + message.cut, block)
+        topic, sequence = f"/topology/{message.header.object}", message.header.epoch + message.cut
+        return self._append(topic, message, stamp, sequence, block, counts=not again)
 
     def obstacle(self, message: pb.Obstacle, block: bool = False) -> None:
         self._append(f"/obstacle/{message.header.object}", message, self._time, 0, block)
@@ -151,7 +157,15 @@ class Recorder:
             self._time = round(seconds * 1e9)
         return self._time
 
-    def _append(self, topic: str, message: Message, log_time: int, sequence: int, block: bool) -> None:
+    def skip_frame(self) -> None:
+        """Counts a frame as dropped that is not appended, as its mesh is not in the log yet."""
+        with self._changed:
+            self.dropped += 1
+
+    def _append(
+        self, topic: str, message: Message, log_time: int, sequence: int, block: bool, counts: bool = True
+    ) -> bool:  # fmt: skip
+        """Returns False if there is no room; counts: it is dropped or lost then. True after the end of the log."""
         record = _Record(
             topic, type(message), log_time, time.time_ns(), sequence & 0xFFFFFFFF, message.SerializeToString()
         )
@@ -160,13 +174,15 @@ class Recorder:
             if block:
                 self._changed.wait_for(lambda: self._fits(record, self._frame_bytes) or self.failure or self._closing)
             if self._closing or self.failure:
-                return
+                return True
             if not block and not self._fits(record, limit):
-                self._count_dropped(record)
-                return
+                if counts:
+                    self._count_dropped(record)
+                return False
             self._waiting.append(record)
             self._waiting_bytes += len(record.data)
             self._changed.notify_all()
+            return True
 
     def _fits(self, record: _Record, limit: int) -> bool:
         return not self._waiting or self._waiting_bytes + len(record.data) <= limit

@@ -208,11 +208,13 @@ class Recording:
 
 
 def reaction_digests(message: pb.ObjectStep) -> dict[str, int]:
-    """Returns a digest of the reactions of a step by kind: obstacle, object, grab."""
+    """Returns a digest of the reactions of a step by kind: obstacle, object, grab; and of its readings: reading."""
     kinds: dict[str, bytes] = {}
     for reaction in message.reactions:
         kind = reaction.WhichOneof("on") or ""
         kinds[kind] = kinds.get(kind, b"") + reaction.SerializeToString(deterministic=True)
+    for told in message.readings:
+        kinds["reading"] = kinds.get("reading", b"") + told.SerializeToString(deterministic=True)
     return {kind: checksum(data) for kind, data in kinds.items()}
 
 

@@ -69,7 +69,9 @@ class Comparison:
             now, then = reaction_digests(step), self.recording.objects[name].reactions
             for kind in sorted(self.kinds):
                 if now.get(kind) != then.get((step.step, kind)):
-                    self.diverged(step.step, name, "reaction", f"other forces on {kind}s than recorded")
+                    what = "reading" if kind == "reading" else "reaction"
+                    said = "other readings" if kind == "reading" else f"other forces on {kind}s"
+                    self.diverged(step.step, name, what, f"{said} than recorded")
 
     def frame(self, step: int, name: str, recorded: Pair, now: Pair) -> None:
         """Compares positions and velocities (nodes, 3) of one object after a step."""

@@ -141,7 +141,8 @@ class Replay:
             self.compared.solves(records, [self._row(b.name, step) for b in self.bodies])
             if self.compared.kinds:
                 exerted = messages.reactions(self.simulation, on_obstacles, self.engine.other_reactions())
-                self.compared.reactions(messages.steps(self.simulation, records, reactions=exerted))
+                told = messages.readings(self.simulation, self.engine.readings)
+                self.compared.reactions(messages.steps(self.simulation, records, reactions=exerted, readings=told))
             self._compare_frames(step + 1)
             progress(step + 1)
         return self.compared

@@ -91,7 +91,7 @@ def _finite(v: pb.Vector, what: str) -> Float64:
 
 class CutTelemetry:
     """Numbers the cuts of each object as the loop takes them up; gives log and network the topologies without what was
-    removed. The log has of each only what a cut changes."""
+    removed. The log has of each only what a cut changes; what a slow disk has no room for comes with the next frame."""
 
     def __init__(self, simulation: Simulation, link: ServerLink, recorder: Recorder | None, patient: bool):
         self._simulation, self._link, self._recorder, self._patient = simulation, link, recorder, patient
@@ -100,6 +100,9 @@ class CutTelemetry:
         self._taken: dict[str, deque[tuple[int, int]]] = {
             b.name: deque([(-1, 0)], maxlen=KEPT) for b in self._bodies.values()
         }  # steps before the first with it, and number, of cuts
+        self._unwritten: dict[str, deque[tuple[pb.Topology, float]]] = {
+            b.name: deque(maxlen=KEPT) for b in self._bodies.values()
+        }  # what the log had no room for, and from when it holds [s]
         self._skins: dict[str, Int64] = {}  # element of each vertex
         self.removed: dict[str, int] = {}  # elements, by object
         if self._bodies:
@@ -117,6 +120,16 @@ class CutTelemetry:
         if name not in self._taken:
             return 0
         return next((number for taken, number in reversed(self._taken[name]) if taken < step), 0)
+
+    def written(self, name: str) -> bool:
+        """Gives the log what it had no room for of an object; returns True if it has all of its meshes now."""
+        waiting = self._unwritten.get(name)
+        while waiting and self._recorder is not None:
+            message, time = waiting[0]
+            if not self._recorder.topology(message, block=self._patient, time=time, again=True):
+                return False
+            waiting.popleft()
+        return True
 
     def take(self) -> None:
         """Tells of the cuts that the loop has taken up since the last call, before frames are sent."""
@@ -147,7 +160,8 @@ class CutTelemetry:
             message = pb.Topology(header=pb.Header(object=body.name, epoch=1), nodes=body.last - body.first)
             change(message)
             time = max(step, 0) * self._simulation.world.dt
-            self._recorder.topology(message, block=self._patient, time=time)
+            self._unwritten[body.name].append((message, time))
+            self.written(body.name)
 
     def _cut_of(self, body: Body, removed: Int64, number: int) -> pb.Topology:
         """Returns the fields of a topology that change once these elements are gone."""

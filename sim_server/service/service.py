@@ -79,7 +79,7 @@ class Service:
         self.commands = Commands(simulation, self._record_interaction, self._frozen)
         self.telemetry = Telemetry(self.driver, link, recorder, not realtime, self.commands)
         self._set_intervals()
-        self._batches: deque[tuple[NDArray[Any], Float64, NDArray[Any]]] = deque()  # records and their reactions
+        self._batches: deque[tuple[NDArray[Any], ...]] = deque()  # records and what comes with them
         self._failure: BaseException | None = None
         self._status_replies: list[Callable[[pb.Reply], None]] = []  # of clients that requested a status
         self._halts = Halts(self.commands)
@@ -154,7 +154,7 @@ class Service:
                     self.engine.run(ENDLESS if self._last is None else self._last - self.engine.step)
                 return
             while not self.engine.loop.stop and (self._last is None or self.engine.step < self._last):
-                self._batches.append((self.driver.advance(1), self.driver.reactions, self.driver.other_reactions))
+                self._batches.append((self.driver.advance(1), *self.driver.beside_records))
         except BaseException as error:
             self._failure = error
 
@@ -348,17 +348,19 @@ class Service:
         if self._first is not None and not self._first.done:
             return  # no step is made yet, and the policy is not to act
         if self._loop_alone:
-            self._report(self.driver.pump(), self.driver.reactions, self.driver.other_reactions)
+            self._report(self.driver.pump(), *self.driver.beside_records)
             return
         batches = [self._batches.popleft() for _ in range(len(self._batches))]
         if batches:
             self._report(*(np.concatenate(part) for part in zip(*batches, strict=True)))
         else:
             none = np.zeros((0, len(self.simulation.world.obstacles), 6))
-            self._report(np.zeros(0, self.engine.records_dtype), none, np.zeros(0, REACTION))
+            self._report(np.zeros(0, self.engine.records_dtype), none, np.zeros(0, REACTION), np.zeros((0, 0)))
 
-    def _report(self, records: NDArray[Any], on_obstacles: Float64, others: NDArray[Any]) -> None:
-        """Passes on new step records with what objects exerted on obstacles and others, and new frames."""
+    def _report(
+        self, records: NDArray[Any], on_obstacles: Float64, others: NDArray[Any], readings: Float64
+    ) -> None:  # fmt: skip
+        """Passes on new step records with what objects exerted on obstacles and others, readings, and new frames."""
         contact = self.telemetry.contact
         undone = [*contact.count_clipped(records), *contact.crowded_nodes(), *contact.broken_ties()]
         for line in [*self.telemetry.count_unconverged(records), *undone]:
@@ -367,7 +369,8 @@ class Service:
             log.error("%s", line)
         if self.pace is not None and len(records):
             self.pace.add(records)
-        self.telemetry.records(records, messages.reactions(self.simulation, on_obstacles, others))
+        exerted = messages.reactions(self.simulation, on_obstacles, others)
+        self.telemetry.records(records, exerted, messages.readings(self.simulation, readings))
         self.telemetry.frames()
         self._set_intervals()
 

@@ -20,7 +20,7 @@ from sim_server.mechanics.world import Body
 from sim_server.network.link import ServerLink
 from sim_server.parameters import ParameterUpdate
 from sim_server.recording import messages
-from sim_server.recording.object_steps import Reactions
+from sim_server.recording.object_steps import Reactions, Readings
 from sim_server.recording.obstacles import pose_messages
 from sim_server.recording.recorder import Recorder
 from sim_server.recording.replay_recorder import ReplayRecorder
@@ -74,6 +74,7 @@ class Telemetry:
         self.seconds: deque[float] = deque(maxlen=STATISTICS_STEPS)
         self._last: NDArray[Any] = np.zeros(len(self._window), self.engine.records_dtype)
         self._last_reactions: dict[int, tuple[Reactions, int]] = {}  # by body, and the number of its record in them
+        self._last_readings: dict[int, Readings] = {}  # by body, one record
         self._not_finite: set[str] = set()  # objects of which it was said
         self.solves = 0
         self.pace = ""  # why the run does not keep pace with the clock; empty: it does, or need not
@@ -120,15 +121,15 @@ class Telemetry:
         self._due[what] = now + period
         return True
 
-    def records(self, records: NDArray[Any], reactions: Reactions) -> None:
-        """Sends step records, each to the log, in batches to subscribers. reactions: of these records."""
+    def records(self, records: NDArray[Any], reactions: Reactions, readings: Readings | None = None) -> None:
+        """Sends step records, each to the log, in batches to subscribers. reactions, readings: of these records."""
         if self.replay_recorder:
             self.replay_recorder.write(self.patient)
         if len(records):
             self.seconds.extend(records["whole"][records["body"] == 0].tolist())
-            self.update_summary(records, reactions)
+            self.update_summary(records, reactions, readings)
             self.reactions.publish(records, reactions)
-            steps = self._messages(records, reactions)
+            steps = self._messages(records, reactions, readings)
             self._add_interactions(steps)
             if self.recorder:
                 for step in steps:
@@ -139,8 +140,10 @@ class Telemetry:
                 self.link.publish_steps(pb.Steps(steps=self._batch))
             self._batch.clear()
 
-    def update_summary(self, records: NDArray[Any], reactions: Reactions | None = None) -> None:
-        """Keeps what the status tells of steps: the last records and reactions of bodies, iterations and energies."""
+    def update_summary(
+        self, records: NDArray[Any], reactions: Reactions | None = None, readings: Readings | None = None
+    ) -> None:
+        """Keeps what the status tells of steps: records, reactions and readings, iterations and energies."""
         order = np.argsort(records["body"], kind="stable")
         present, first = np.unique(records["body"][order], return_index=True)
         iterations = records["iterations"][order].tolist()
@@ -150,16 +153,22 @@ class Telemetry:
         if reactions is not None and reactions.any:
             for body, record in zip(present.tolist(), newest.tolist(), strict=True):
                 self._last_reactions[body] = reactions, record
+        if readings is not None and readings.measured:
+            for body, record in zip(present.tolist(), newest.tolist(), strict=True):
+                self._last_readings[body] = readings[record : record + 1]
         for body, begin, end in zip(present.tolist(), first.tolist(), ends, strict=True):
             self._window[body].extend(iterations[begin:end])
         for r in records[np.isfinite(records["elastic"])]:
             self._energy[int(r["body"])] = float(r["kinetic"] + r["elastic"] + r["gravity"])
 
-    def _messages(self, records: NDArray[Any], reactions: Reactions) -> list[pb.ObjectStep]:
+    def _messages(
+        self, records: NDArray[Any], reactions: Reactions, readings: Readings | None
+    ) -> list[pb.ObjectStep]:  # fmt: skip
         """Makes messages for the log and for subscribers only: it is the most expensive part of telemetry."""
         most = len(records) if self.recorder else MAX_BATCH if self.link.wants_steps() else 0
         wanted = slice(max(len(records) - most, 0), None)
-        steps = messages.steps(self.simulation, records[wanted], self._method, reactions[wanted])
+        told = None if readings is None else readings[wanted]
+        steps = messages.steps(self.simulation, records[wanted], self._method, reactions[wanted], told)
         bound = self.driver.age_bound() if steps else -1
         for step in steps:
             step.excess = self.driver.by_name[step.header.object].solves.excess
@@ -175,7 +184,8 @@ class Telemetry:
             return None
         reactions, at = self._last_reactions.get(body, (None, 0))
         own = None if reactions is None else reactions[at : at + 1]
-        message = messages.steps(self.simulation, self._last[body : body + 1], self._method, own)[0]
+        record, told = self._last[body : body + 1], self._last_readings.get(body)
+        message = messages.steps(self.simulation, record, self._method, own, told)[0]
         message.excess, message.factor_age_bound = self.driver.bodies[body].solves.excess, bound
         return message
 
@@ -262,7 +272,10 @@ class Telemetry:
     def _record_frame(self, step: int, x: Float64, v: Float64, poses: Float64 | None = None) -> None:
         assert self.recorder is not None
         for body in self.simulation.world.bodies:
-            self.recorder.state(self._state(body, step, x, v), block=self.patient)
+            if self.cuts.written(body.name):
+                self.recorder.state(self._state(body, step, x, v), block=self.patient)
+            else:
+                self.recorder.skip_frame()
         self.contact.record_poses(step, poses, block=self.patient)
 
     def _on_set(self, update: ParameterUpdate) -> None:

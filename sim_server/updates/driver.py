@@ -40,6 +40,7 @@ class Driver:
     reactions: (k, obstacles, 6) force [N] and torque [N m] on each obstacle by the object of each record that was
         returned last
     other_reactions: (k,) of struct Reaction, on grabs and other objects, in the steps of those records
+    readings: of those records, the numbers of `measured` of the object of each, (k, most of an object)
     counted: the scheduler and `auto` reckon with bytes and operations instead of seconds, so that a run repeats
         exactly; None: unless no step waits for a factor
     """
@@ -63,6 +64,7 @@ class Driver:
             self.check.prepare()
         self.reactions: Float64 = np.zeros((0, 0, 6))
         self.other_reactions: NDArray[Any] = np.zeros(0, REACTION)
+        self.readings: Float64 = np.zeros((0, 0))
         self.on_adopt: list[Callable[[Factor], Any]] = []  # called with every factor that the loop is given
         self.snapshots = SnapshotPool(simulation, self.source, self.policy.expected_latency)
         self.useless_factors = UselessFactors(self)
@@ -73,18 +75,23 @@ class Driver:
 
     def advance(self, steps: int) -> NDArray[Any]:
         """Makes steps; returns their records (structs.RECORD)."""
-        out: list[tuple[NDArray[Any], Float64, NDArray[Any]]] = []
+        out: list[tuple[NDArray[Any], ...]] = []
         for _ in range(steps):
             if self.wants_factors:
                 self.policy.step()
             else:
                 self.engine.run(1)
-            out.append((self._new_records(), self.reactions, self.other_reactions))
+            out.append((self._new_records(), *self.beside_records))
         if not out:
-            out.append((*self.engine.records_and_reactions(), self.engine.other_reactions()))
-        records, reactions, others = zip(*out, strict=True)
-        self.reactions, self.other_reactions = np.concatenate(reactions), np.concatenate(others)
-        return np.concatenate(records)
+            out.append((*self.engine.records_and_reactions(), self.engine.other_reactions(), self.engine.readings))
+        records, *others = (np.concatenate(part) for part in zip(*out, strict=True))
+        self.reactions, self.other_reactions, self.readings = others
+        return records
+
+    @property
+    def beside_records(self) -> tuple[Float64, NDArray[Any], Float64]:
+        """Reactions, other reactions and readings of the records that were returned last."""
+        return self.reactions, self.other_reactions, self.readings
 
     def pump(self) -> NDArray[Any]:
         """Reads records, posts factors and sends matrices while the loop runs on its own. Returns the new records."""
@@ -109,7 +116,7 @@ class Driver:
 
     def _new_records(self) -> NDArray[Any]:
         records, self.reactions = self.engine.records_and_reactions()
-        self.other_reactions = self.engine.other_reactions()
+        self.other_reactions, self.readings = self.engine.other_reactions(), self.engine.readings
         self.observe(records)
         return records
 

@@ -57,8 +57,11 @@ def test_loads_are_built(cupy, tmp_path, scheme, precision):
     loads |= {"traction": {"where": "X > 0.99", "pressure": 2.0}, "fixed": {"where": "X < 0.01"}}
     given = hollow(tmp_path, loads.pop("cavity"), box(), **loads)
     sim = Simulation(scene(given, integrator={"scheme": scheme}, gravity=G, precision=precision), "gpu")
+    assert "report_measured" in [kernel for kernel, _ in cupy.calls]
     sim.engine.run(3)
     assert sim.engine.step == 3
+    sim.engine.records()
+    assert sim.engine.readings.shape == (3, 8)  # two of each cavity and cable
     names = {x.name for x in sim.step_launches}
     assert {"traction.load"}.union(*(launches for _, launches in LOADS.values())) <= names
     assert all(x.domain in DOMAINS for x in sim.step_launches if x.name in names and x.name.split(".")[0] in LOADS)

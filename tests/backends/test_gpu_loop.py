@@ -15,6 +15,7 @@ from sim_server.backends.cpu.structs import REACTION, REACTION_KINDS
 from sim_server.backends.gpu.loop import BATCH, CAPACITY, FRAMES
 from sim_server.backends.gpu.mailbox import ChangeMailbox
 from sim_server.backends.gpu.structs import NEWTON_RESULT, PAIR_SUM, STAGE_RESULT
+from sim_server.backends.measured import Measured
 from sim_server.backends.rosenbrock import FORMS
 from sim_server.errors import DeviceLost
 from tests.backends.fake_cuda import BALANCE_GRAPH, ELASTIC_GRAPH, NOT_READY, STEPS, TIMED, FakeScene, number
@@ -530,6 +531,19 @@ def test_what_bodies_exert_on_each_other_is_told_of_both():
     assert first["force"][:, 1].tolist() == [-5.0, 5.0, -2.0, 2.0]
     assert (first["point"] == (1, 0, 0)).all() and not first["torque"].any()
     assert not (told["step"] == 2).any() and (told["step"] == 3).sum() == 6
+
+
+def test_records_come_with_the_numbers_of_their_bodies() -> None:
+    scene = FakeScene(bodies=3)
+    measured = [Measured(body, "cable", "tension", "N", np.zeros(1), 0) for body in (0, 2, 2)]
+    results = np.arange(3.0 * CAPACITY).reshape(CAPACITY, 3)
+    scene.loop.report_measured(measured, results)
+    scene.loop.run(CAPACITY + 1)
+    records = scene.loop.records()
+    assert records["body"][-3:].tolist() == [0, 1, 2]
+    told = scene.loop.readings.reshape(CAPACITY + 1, 3, 2)
+    expected = np.concatenate([results, results[:1]])
+    assert (told[:, 0, 0] == expected[:, 0]).all() and (told[:, 2] == expected[:, 1:]).all()
 
 
 def test_forces_wait_for_the_record_of_their_step():

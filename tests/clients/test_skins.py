@@ -44,6 +44,22 @@ def test_it_moves_with_the_nodes() -> None:
     assert mesh_of(topology("beam")).skin is None
 
 
+def test_a_skin_that_was_cut_has_the_faces_that_were_laid_bare() -> None:
+    """Without the second element: the face that both had, at its nodes, beside what is left of the skin."""
+    left = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]], np.int32)
+    cut = message(triangles=TRIANGLES[:0])
+    cut.cut, cut.removed, cut.triangles = 1, np.array([1], "<i4").tobytes(), left.astype("<i4").tobytes()
+    for before in (None, mesh_of(message())):
+        mesh = mesh_of(cut, before)
+        skin = mesh.skin
+        assert skin is not None and mesh.epoch == 2
+        at = skin.positions(positions(3))
+        np.testing.assert_allclose(at[: len(NODES)], at_vertices(positions(3)), atol=1e-15)
+        np.testing.assert_array_equal(at[skin.triangles], positions(3)[left[3:]])
+        again = mesh_of(cut, mesh).skin
+        assert again is not None and len(again.nodes) == len(skin.nodes)
+
+
 @pytest.mark.parametrize(
     ("changed", "said"),
     [

@@ -18,6 +18,7 @@ from clients.client import Client
 from clients.errors import BadInput, ClientError
 from clients.log.frames import mesh_of
 from clients.log.reader import Log
+from clients.log.scalars import columns, row
 from clients.viewer import view
 from clients.viewer.colors import colors
 from clients.viewer.screenshot import has_vulkan_driver
@@ -104,6 +105,24 @@ def test_rrd_curves(log: Log, tmp_path: Path) -> None:
     assert curve("energy/elastic/beam") == [(s.step, 3.0 + s.step) for s in steps if s.step % 3 == 0]
     assert curve("energy/dissipated/beam") == [(s.step, 0.25 * s.step) for s in steps if s.step % 3 == 0]
     assert len(curve("energy/work/beam")) == len(curve("energy/gravity/beam")) == len(steps) - 1
+
+
+def test_readings_have_a_plot_of_each_quantity(tmp_path: Path) -> None:
+    rr = pytest.importorskip("rerun")
+    from clients.viewer.rerun_scene import RerunScene
+
+    recording = rr.RecordingStream("test")
+    recording.save(tmp_path / "run.rrd")
+    steps = [object_step("beam", step) for step in (1, 2, 3)]
+    for step in steps[1:]:
+        step.readings.add(of="cavity[1]", quantity="pressure", unit="Pa", value=5.0 * step.step)
+    scene = RerunScene(recording, "displacement")
+    scene.steps("beam", columns(map(row, steps)), step_time=False)
+    assert scene.quantities == 1
+    recording.flush()
+    recording.disconnect()
+    found = Rrd(tmp_path / "run.rrd").column("/plots/reading/pressure/cavity\\[1\\]\\ of\\ beam", "scalars")
+    assert [(step, float(values[0])) for step, _, values in found] == [(2, 10.0), (3, 15.0)]
 
 
 def test_colors_have_one_scale_for_the_run(log: Log) -> None:

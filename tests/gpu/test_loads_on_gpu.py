@@ -73,11 +73,14 @@ def test_a_body_with_all_loads_moves_as_on_the_cpu(tmp_path, scheme):
     ends = []
     for device in ("gpu", "cpu"):
         sim = made(tmp_path, LOADS, device, SCHEMES[scheme], tolerance=1e-10)
-        records = Driver(sim).advance(20)
+        driver = Driver(sim)
+        records = driver.advance(20)
         assert set(records["status"].tolist()) <= {SolveStatus.CONVERGED, SolveStatus.MAX_LINEARIZATIONS}
-        ends.append((sim.fetch().x.copy(), records["work"][-1]))
+        ends.append((sim.fetch().x.copy(), records["work"][-1], driver.readings))
     np.testing.assert_allclose(ends[0][0], ends[1][0], atol=1e-6)
     assert ends[0][1] == pytest.approx(ends[1][1], rel=1e-4)
+    assert ends[0][2].shape == (20, 8)
+    np.testing.assert_allclose(ends[0][2], ends[1][2], rtol=1e-4, atol=1e-9)
 
 
 def test_explicit_substeps_with_all_loads_are_those_of_the_cpu(tmp_path):

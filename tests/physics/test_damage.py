@@ -8,14 +8,13 @@ import pytest
 from numpy.typing import NDArray
 
 from sim_server.errors import InputError
-from sim_server.scene.model import Scene
 from sim_server.simulation import Simulation
+from tests.bench.verification.tearing import AREA, ENERGY, OPENING, STRENGTH, YOUNG, expected, torn
 from tests.reference import history as reference
 from tests.scenes import bar, elastic, simulation
 
-YOUNG, POISSON = 1e5, 0.3
+POISSON = 0.3
 LAW = {"young": YOUNG, "poisson": POISSON}
-STRENGTH, ENERGY = 1e3, 20.0
 FIRST = STRENGTH / YOUNG
 
 
@@ -119,49 +118,16 @@ def test_forces_matrix_and_energy_are_those_of_elements_that_are_softer(measure:
     np.testing.assert_allclose(K, other, atol=1e-10 * np.abs(K).max())
 
 
-WEAK, OPENING = 0.8 * STRENGTH, 0.15
-
-
-def torn(cells: int) -> float:
-    """Work [J] that takes a bar of 1 x 0.25 x 0.25 m apart by 0.15 m, one layer of whose cells is weaker."""
-    width = 1 / cells
-    layer = f"abs(X - {0.5 + width / 2}) < {0.49 * width}"
-    frames = [{"time": 0.0}, {"time": 1.0, "translate": [OPENING, 0, 0]}]
-    grip = {"name": "grip", "object": "bar", "where": "X > 0.99", "keyframes": frames}
-    fixed = [{"where": "X < 0.01"}, {"where": "true", "along": ["y", "z"]}]
-    strength = [{"where": layer, "strength": WEAK}, {"strength": STRENGTH}]
-    damage = {"strength": strength, "fracture_energy": ENERGY, "most": 0.999}
-    effects = {"corotational": LAW | {"poisson": 0.0}, "damage": damage, "fixed": {"tables": fixed}}
-    mesh = {"bar": [cells, 2, 2], "size": [1, 0.25, 0.25], "split": "kuhn"}
-    sim = Simulation(Scene.model_validate({
-        "name": "test", "dt": 0.005, "object": [{"name": "bar", "mesh": mesh, "effects": effects}], "holder": [grip],
-        "integrator": {"scheme": "quasi_static", "linearizations": 400, "tolerance": 1e-5},
-        "solver": {"preconditioner": "block_jacobi", "tolerance": 1e-9, "max_iterations": 4000},
-    }))  # fmt: skip
-    force = [0.0]
-    for _ in range(200):
-        sim.engine.run(1)
-        force.append(-sim.world.reaction[0, 0, 0])
-    broken = sim.effects["damage"]
-    band = np.abs(sim.world.rest[broken.elements].mean(axis=1)[:, 0] - 0.5 - width / 2) < width / 2
-    assert broken.damage[band].min() > 0.99
-    assert broken.damage[~band].max() == 0
-    return float(np.trapezoid(force, dx=OPENING / 200))
-
-
 @pytest.mark.parametrize("cells", [4, 8])
 def test_a_crack_takes_the_fracture_energy_by_the_size_of_its_elements(cells: int):
     """All in the weak layer; its energy is that of a crack times its width over the size of its elements."""
-    width, area = 1 / cells, 0.25**2
-    size = float(np.cbrt(6 * np.sqrt(2) * width * 0.125**2 / 6))
-    first, kf = WEAK / YOUNG, ENERGY / (size * WEAK) - WEAK / YOUNG / 2
-    strain = np.linspace(0, OPENING / width, 100001)
-    intact = np.maximum(np.minimum(1, first / np.maximum(strain, 1e-9) * np.exp(-(strain - first) / kf)), 1e-3)
-    intact = np.where(strain < first, 1, intact)
-    work = width * area * np.trapezoid(intact * YOUNG * strain, strain)
-    np.testing.assert_allclose(torn(cells), work, rtol=0.02)
-    crack = ENERGY * area * width / size
-    assert crack < work < crack + width * area * 0.5 * 1e-3 * YOUNG * strain[-1] ** 2  # what is left bears a little
+    found = torn(cells)
+    assert found.damage[found.weak].min() > 0.99
+    assert found.damage[~found.weak].max() == 0
+    work, crack = expected(cells)
+    np.testing.assert_allclose(found.work, work, rtol=0.02)
+    strain = OPENING * cells
+    assert crack < work < crack + AREA / cells * 0.5 * 1e-3 * YOUNG * strain**2  # what is left bears a little
 
 
 @pytest.mark.parametrize("scheme", ["backward_euler", "newmark", "bdf2", "generalized_alpha"])

@@ -2,6 +2,7 @@
 """The scenes that come along: found by name, good meshes, and 30 steps of each to a known displacement."""
 
 import os
+import re
 from pathlib import Path
 from typing import Any
 
@@ -13,8 +14,10 @@ from scipy.sparse.csgraph import connected_components
 
 from clients.accuracy.study import check_scene
 from clients.errors import BadInput
+from deploy.gallery import hollow_finger
 from deploy.gallery.__main__ import MESHES
 from deploy.gallery.mesher import dihedral_angles, mesh, skin, surface, volumes
+from deploy.gallery.pictures import BLADE, CUT, EFFECTS, PUSH
 from sim_server.errors import InputError
 from sim_server.mesh import read
 from sim_server.scene import gallery, load
@@ -87,6 +90,34 @@ def test_its_page_shows_each_scene_with_its_sentence_and_its_command() -> None:
         assert gallery.sentence(name) in parts[name] and f"](figures/gallery/{name}.png)" in parts[name]
         assert (docs / "figures" / "gallery" / f"{name}.png").stat().st_size < 200_000
     assert (docs / "figures" / "creature.gif").stat().st_size < 1_500_000
+
+
+def test_its_page_shows_each_scene_of_an_effect_with_its_sentence_and_its_command() -> None:
+    docs = Path(__file__).parents[2] / "docs"
+    parts = dict(part.split("\n", 1) for part in (docs / "gallery.md").read_text().split("\n### ")[1:])
+    assert set(parts) == {CUT, *EFFECTS}
+    for name, part in parts.items():
+        assert f"](figures/gallery/{name}.png)" in part
+        assert (docs / "figures" / "gallery" / f"{name}.png").stat().st_size < 100_000
+    for name in EFFECTS:
+        said = (docs.parent / "deploy" / "scenes" / f"{name}.toml").read_text().split("\n", 1)[0].lstrip("# ")
+        assert f"sim-server deploy/scenes/{name}.toml --workers 1\n" in parts[name]
+        assert re.split(r"\.( |$)|: \d", said)[0] in parts[name]
+
+
+def test_the_page_cuts_the_liver_as_its_picture_was_made() -> None:
+    found = (Path(__file__).parents[2] / "docs" / "gallery.md").read_text()
+    at, force = (" ".join(f"{c:g}" for c in PUSH[key]) for key in ("at", "force"))
+    push = f"push --object liver --at {at} --radius {PUSH['radius']} --force {force} --duration {PUSH['duration']:g} "
+    blade = ", ".join(" ".join(f"{c:g}" for c in corner) for corner in BLADE)
+    assert f'sim-client {push}&& sim-client cut --object liver --blade "{blade}"\n' in found
+
+
+def test_the_fingers_mesh_is_made_as_it_is_told() -> None:
+    x, tets = hollow_finger.mesh()
+    found = read(hollow_finger.FILE)
+    assert (found.rest == x).all() and (found.tets == tets).all()
+    assert edge_uses(surface(tets)[0]) == {2} and volumes(x, tets).min() > 0
 
 
 @pytest.mark.parametrize("name", sorted(LITRES))

@@ -236,6 +236,8 @@ def test_the_folder_is_the_registry():
         ("two_organs", [864, 972]),
         ("needle_holder", [1728]),
         ("graft", [972, 648]),
+        ("needle", [3600, 72]),
+        ("soft_gripper", [1344] * 3),
         ("heap", [180] * 12),
         ("pile", [540] * 50),
     ],

@@ -496,6 +496,11 @@ class CpuEngine(Reports):
             loop.holders, loop.held_reaction = given.held.shape[1], given.held.ctypes.data
         self._held = given.held
         self.report_reactions(obstacles + loop.holders, obstacles)
+        if given.measured:
+            self._measured_first = self.report_readings(given.measured, bodies)
+            addresses = [m.array.ctypes.data + m.array.itemsize * m.index for m in given.measured]
+            self._measured = np.array(addresses, np.uint64)
+            loop.measured, loop.measured_first = self._measured.ctypes.data, self._measured_first.ctypes.data
         if given.touch is not None:
             touch = cast(CpuLaunch, given.touch)
             loop.touch = c.addressof(self._launch[number[id(touch)]])

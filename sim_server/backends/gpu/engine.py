@@ -30,6 +30,7 @@ from sim_server.backends.gpu.held import HeldForces, leading
 from sim_server.backends.gpu.kernel_fusion import DOMAINS, Epilogue, FusedKernel, fuse
 from sim_server.backends.gpu.loop import CAPACITY, MANY, DeviceLoop
 from sim_server.backends.gpu.mailbox import ChangeMailbox, DeviceMailbox
+from sim_server.backends.gpu.measured import MeasuredReport
 from sim_server.backends.gpu.newton import NewtonIteration, NewtonPhases
 from sim_server.backends.gpu.rosenbrock import ATTEMPTS, RosenbrockStep
 from sim_server.backends.gpu.solver import PCG_BODY, PCG_RESULT, SETTINGS_BYTES, PcgSolver
@@ -170,6 +171,10 @@ class GpuEngine(DeviceLoop):
         if given.held is not None:
             held = device.pinned(CAPACITY * given.held.nbytes).view(np.float64).reshape(CAPACITY, *given.held.shape)
             self._held = HeldForces(gpu, settled, given.held, held, self._counter)
+        self._measured, measured = None, None
+        if given.measured:
+            measured = device.pinned(CAPACITY * 8 * len(given.measured)).view(np.float64).reshape(CAPACITY, -1)
+            self._measured = MeasuredReport(gpu, given.measured, measured, self._counter)
         row, first = PCG_BODY.itemsize, self.solver.bodies_device
         mailboxes = [(first + row * k, SETTINGS_BYTES) for k in range(bodies)]
         mailboxes += [(first + row * k + SETTINGS_BYTES, row - SETTINGS_BYTES) for k in range(bodies)]
@@ -187,6 +192,8 @@ class GpuEngine(DeviceLoop):
         )  # fmt: skip
         if told:
             self.report_pairs(*told)
+        if measured is not None:
+            self.report_measured(given.measured, measured)
         self._factor_upload = FactorUpload(gpu, self.solver, self, given.names, self.mailboxes[bodies : 2 * bodies])
         for k in range(bodies):
             whole = self.solver.bodies[k : k + 1].tobytes()
@@ -380,12 +387,14 @@ class GpuEngine(DeviceLoop):
         """Appends solve, integration and epilogue."""
         if self._stages:
             self._stages.launch()
-            return
-        (self._newton or self._contact or self._substeps or self.solver).launch()
-        if self._held:
-            self._held.launch()
-        assert self._integrate is not None
-        self._integrate()
+        else:
+            (self._newton or self._contact or self._substeps or self.solver).launch()
+            if self._held:
+                self._held.launch()
+            assert self._integrate is not None
+            self._integrate()
+        if self._measured:
+            self._measured.launch()
 
     def assemble(self) -> None:
         """Runs the first half of one step, and copies the system matrix to the host."""

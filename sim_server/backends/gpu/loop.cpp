@@ -119,6 +119,12 @@ static void note_holders(GpuLoop& l, int64_t from, int64_t place) {
     std::memcpy(end - numbers, l.held_reactions + numbers * from, sizeof(double) * numbers);
 }
 
+// from: place of the step in the results. place: of the record of body i.
+static void note_readings(GpuLoop& l, int64_t from, int i, int64_t place) {
+    const double* first = l.measured + l.measured_count * from;
+    std::copy(first + l.measured_first[i], first + l.measured_first[i + 1], l.rings.readings + l.rings.most_readings * place);
+}
+
 // Puts what bodies exerted on grabs in a step into the ring. from: place of the step in the results.
 static void report_grabs(GpuLoop& l, int64_t from) {
     static thread_local std::vector<Reaction> found;
@@ -181,6 +187,7 @@ static void report(GpuLoop& l, const StepBatch& batch, int64_t k, double end, do
         }
         if (l.contact_results) note_contact(l, slot + i, record, (head + i) % rings.record_capacity);
         if (l.held_reactions) note_holders(l, slot + i, (head + i) % rings.record_capacity);
+        if (l.measured) note_readings(l, (batch.first + k) % l.capacity, i, (head + i) % rings.record_capacity);
         if (l.energy_records) note_energy(record, l.energy_records[slot + i]);
     }
     rings.step.store(step);

@@ -92,6 +92,9 @@ struct GpuLoop {
     const PairSum* pair_sums;              // (capacity, bodies, most_pairs) likewise; null: bodies do not touch each other
     const int32_t* pair_counts;            // (capacity, bodies) likewise, sums of each body; more than most_pairs have no place
     int64_t most_pairs;
+    const double* measured;                // (capacity, measured_count) likewise; null: records come with no numbers of effects
+    const int32_t* measured_first;         // (bodies + 1,) of those of each body
+    int64_t measured_count;
     int64_t obstacles, holders;
     void* grabs;                           // graph that writes what bodies exert on grabs after a step; null: nothing can be touched
     const MailSlot* touch;                 // arguments of pushes and grabs

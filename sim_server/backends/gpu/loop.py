@@ -15,6 +15,7 @@ from sim_server.arrays import Float64
 from sim_server.backends.gpu import structs
 from sim_server.backends.gpu.mailbox import DeviceMailbox, library
 from sim_server.backends.gpu.structs import FRAME_COPIES
+from sim_server.backends.measured import Measured
 from sim_server.backends.ring_buffers import Reports
 from sim_server.errors import DeviceLost
 
@@ -150,6 +151,12 @@ class DeviceLoop(Reports):
         loop.grabs, loop.touch = graph, c.addressof(self._slots[mailbox])
         loop.grab_reactions, loop.grab_counts = reactions.ctypes.data, counts.ctypes.data
         loop.most_grabs = reactions.shape[1]
+
+    def report_measured(self, measured: Sequence[Measured], results: Float64) -> None:
+        """Has records come with numbers of their bodies. results: host memory (CAPACITY, measured) that steps write."""
+        self._measured_written, self._measured_first = results, self.report_readings(measured, self.loop.bodies)
+        self.loop.measured, self.loop.measured_first = results.ctypes.data, self._measured_first.ctypes.data
+        self.loop.measured_count = len(measured)
 
     def report_pairs(self, sums: NDArray[Any], counts: NDArray[Any]) -> None:
         """Has records come with what bodies exert on each other.

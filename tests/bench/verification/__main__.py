@@ -20,6 +20,7 @@ from tests.bench.verification import (
     pores,
     static,
     structures,
+    tearing,
 )
 from tests.bench.verification.row import Row
 
@@ -49,7 +50,7 @@ STATIC: list[tuple[str, Callable[[list[int]], tuple[list[Row], static.Curves]], 
 OTHERS = [
     laws.slopes, laws.patch, laws.uniaxial, motion.time_orders, motion.momentum, motion.energies,
     motion.preconditioners, *bending.CASES, nafems.stresses, memory.viscoelasticity, memory.plasticity,
-    pores.poroelasticity, *actuation.CASES, *structures.CASES,
+    tearing.damage, pores.poroelasticity, *actuation.CASES, *structures.CASES,
 ]  # fmt: skip
 LOCKING = """\
 Sag of a clamped bar of 1 x 1 x 4 m under a small weight over what it should be, by Poisson's ratio: the mean of the

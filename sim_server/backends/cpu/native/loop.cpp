@@ -241,6 +241,11 @@ static void note_holders(const Loop& loop, int index, int64_t slot) {
     std::memcpy(end - held, loop.held_reaction + held * index, sizeof(double) * held);
 }
 
+static void note_readings(const Loop& loop, int index, int64_t slot) {
+    double* target = loop.rings.readings + loop.rings.most_readings * slot;
+    for (int k = loop.measured_first[index]; k < loop.measured_first[index + 1]; ++k) *target++ = *loop.measured[k];
+}
+
 // Reports what bodies exert on grabs and on each other after a step.
 static void report_reactions(Loop& loop, int64_t step) {
     static thread_local std::vector<Reaction> found;
@@ -330,6 +335,7 @@ static void finish_step(Loop* loop) {
             record.cpu = cpu;
             if (loop->energies) note_energy(record, loop->energies->balance[i]);
             if (loop->holders) note_holders(*loop, i, (first + i) % rings.record_capacity);
+            if (loop->measured) note_readings(*loop, i, (first + i) % rings.record_capacity);
         }
         report_reactions(*loop, step);
         rings.record_head.store(first + loop->bodies, std::memory_order_release);

@@ -183,6 +183,8 @@ struct Loop {
     CentralDifference* substeps;       // null: an implicit scheme
     int32_t holders;
     const double* held_reaction;       // (bodies, holders, 6) force [N] and torque [N m] on each; launches that integrate set it
+    double** measured;                 // where the numbers are that records come with, or null
+    const int32_t* measured_first;     // (bodies + 1,) of each body
     double* clock;                     // (1,) s, read by kernels
     int32_t* moving;                   // (bodies,) 0: the body rests (kernels/nodes.cu)
     Energies* energies;                // or null

@@ -76,6 +76,8 @@ struct Rings {
     int64_t record_capacity;
     double* reactions;                     // (record_capacity, reaction_count, 6) of each record
     int64_t reaction_count;                // obstacles, and then holders
+    double* readings;                      // (record_capacity, most_readings) of the body of each record, or null
+    int64_t most_readings;                 // of a body
     std::atomic<int64_t> record_head, record_tail;
     Reaction* others;                      // (other_capacity,) on grabs and other bodies, in the order of steps; there before the step's records
     int64_t other_capacity;
