@@ -2,7 +2,8 @@
 """Meshes and scalars of a run as rerun entities.
 
 /world/OBJECT holds the surface, /world/OBSTACLE too, /plots/QUANTITY/OBJECT a curve, /plots/energy/KIND/OBJECT and
-/plots/estimate/KIND/OBJECT curves of energies and estimated errors; timelines are `step` and `time` (simulated).
+/plots/estimate/KIND/OBJECT curves of energies and estimated errors, /events/OBJECT what went wrong; timelines are
+`step` and `time` (simulated).
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
+from clients.log.events import Events
 from clients.log.frames import Frame, Mesh
 from clients.log.obstacles import Obstacle, ObstacleFrame, Pose
 from clients.log.scalars import REACTION, Columns
@@ -46,6 +48,7 @@ class RerunScene:
         self._shown: dict[str, int] = {}  # object -> epoch whose triangles were logged last
         self._top, self._grow = top, grow
         self._has_contact = False
+        self._events: dict[str, Events] = {}
         self._low = np.full(3, np.inf)
         self._high = np.full(3, -np.inf)
         recording.log("world", rr.ViewCoordinates.RIGHT_HAND_Y_UP, static=True)
@@ -116,6 +119,7 @@ class RerunScene:
             values = scalars[energy]
             self._curve(f"energy/{energy.removesuffix('_energy')}", name, scalars, values, np.isfinite(values))
         self._contact(name, scalars)
+        self._tell(name, scalars)
         if step_time:
             self._curve("step_time", "all", scalars, scalars["step_seconds"] * 1e3, np.ones(len(age), bool))
 
@@ -131,7 +135,8 @@ class RerunScene:
         bodies = rrb.Vertical(
             rrb.Spatial3DView(origin="/world", name="bodies", eye_controls=eye),
             rrb.TextDocumentView(origin="/legend", name="colour"),
-            row_shares=[8, 1],
+            rrb.TextLogView(origin="/events", name="what went wrong"),
+            row_shares=[8, 1, 1],
         )
         plotted = PLOTS | CONTACT_PLOTS if self._has_contact else PLOTS
         plots = rrb.Vertical(
@@ -145,6 +150,14 @@ class RerunScene:
             rrb.TimePanel(state="collapsed", timeline="time"),
             auto_views=False,
         )
+
+    def _tell(self, name: str, scalars: Columns) -> None:
+        """Logs a line at each step in which what goes wrong changes."""
+        for event in self._events.setdefault(name, Events()).changes(scalars):
+            self._recording.set_time("step", sequence=event.step)
+            self._recording.set_time("time", duration=event.time)
+            level = rr.TextLogLevel.WARN if event.wrong else rr.TextLogLevel.INFO
+            self._recording.log(_entity("events", name), rr.TextLog(event.text, level=level))
 
     def _contact(self, name: str, scalars: Columns) -> None:
         """Logs what a run with obstacles has beside the others."""

@@ -27,6 +27,7 @@ from sim_server.recording.replay_recorder import ReplayRecorder
 from sim_server.service.commands import Commands
 from sim_server.service.contact_telemetry import ContactTelemetry
 from sim_server.service.cuts import CutTelemetry
+from sim_server.service.event_counts import EventCounts
 from sim_server.service.reaction_telemetry import ReactionTelemetry
 from sim_server.simulation import Simulation
 from sim_server.updates.driver import Driver
@@ -80,6 +81,7 @@ class Telemetry:
         self.unconverged: Counter[str] = Counter()  # solves by status, of those that did not converge
         self._energy: dict[int, float] = {}  # by body, kinetic + elastic + gravity of the last step with all three [J]
         self.runaways: Counter[int] = Counter()  # steps by body
+        self.events = EventCounts()
         self._has_listeners = False
         self._due = {"steps": 0.0, "state": 0.0, "status": 0.0, "look": 0.0}
         self._has_viewers = False
@@ -147,6 +149,7 @@ class Telemetry:
         ends = [*first[1:].tolist(), len(order)]
         newest = order[np.array(ends) - 1]
         self._last[present] = records[newest]
+        self.events.add(records)
         if reactions is not None and reactions.any:
             for body, record in zip(present.tolist(), newest.tolist(), strict=True):
                 self._last_reactions[body] = reactions, record
@@ -229,6 +232,7 @@ class Telemetry:
         for body in world.bodies:
             if name in ("", body.name):
                 self.runaways.pop(body.index, None)
+                self.events.clear(body.index)
                 self._not_finite.discard(body.name)
         self.contact.on_reset()
         if self.replay_recorder:
@@ -319,6 +323,7 @@ class Telemetry:
                     total_energy=self._energy.get(body.index),
                     clipped=self.contact.clipped[body.index],
                     crowded=self.contact.crowded[body.index],
+                    events=self.events.of(body.index),
                 )
             )
         status.obstacles.extend(pose_messages(self.simulation, status.step, fixed=True))
