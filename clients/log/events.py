@@ -8,7 +8,11 @@ from typing import NamedTuple
 
 from clients.log.scalars import Columns
 
-COUNTS = {"fallbacks": "a factor left for block Jacobi", "clipped": "nodes held back at an obstacle"}
+COUNTS = {
+    "fallbacks": "a factor left for block Jacobi",
+    "halvings": "ran away, made again by short steps",
+    "clipped": "nodes held back at an obstacle",
+}
 """Columns that are above 0 in a step in which this happened."""
 
 

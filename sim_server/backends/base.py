@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from sim_server.backends.contact import Contact
     from sim_server.backends.energies import Energies
     from sim_server.backends.euler_form import EulerForm
+    from sim_server.backends.halving import Halving
     from sim_server.backends.newton import Newton
     from sim_server.backends.rank_one import RankOne
     from sim_server.backends.rosenbrock import Rosenbrock
@@ -339,6 +340,7 @@ class EngineInput:
     arrays: of the system by name: row_start, columns, values, b, y, x, v, clock, moving, rotation
     history: launches that begin every step, once, whatever attempts, trials or stages it takes
     cut: of bodies that may lose elements; None: no object lists the effect
+    halving: short steps of bodies that ran away; None: these are frozen, or go on
     """
 
     assemble: Sequence[Launch]
@@ -360,6 +362,7 @@ class EngineInput:
     arrays: Mapping[str, NDArray[Any]]
     history: Sequence[Launch] = ()
     cut: CutInput | None = None
+    halving: Halving | None = None
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from protocol import messages_pb2 as pb
 
 STATUSES = {value.number: value.name.lower() for value in pb.SolveStatus.DESCRIPTOR.values}
-COLUMNS = ("fallbacks",)  # of the step record: above 0 in a step that counts
+COLUMNS = ("fallbacks", "halvings")  # of the step record: above 0 in a step that counts
 
 
 class EventCounts:

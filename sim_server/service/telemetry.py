@@ -375,7 +375,7 @@ class Telemetry:
         for r in away[np.unique(away["body"], return_index=True)[1]]:
             body = self.simulation.world.bodies[int(r["body"])]
             if body.index not in self.runaways:
-                frozen = self.simulation.energies.on_runaway == "freeze"
+                frozen = self.simulation.energies.freezes
                 then = "it is frozen where the step began" if frozen else "it goes on"
                 lines.append(
                     f"object {body.name!r}, step {int(r['step'])}: runaway: {cause_of(r)}; {then} "
