@@ -82,6 +82,7 @@ class Telemetry:
         self._energy: dict[int, float] = {}  # by body, kinetic + elastic + gravity of the last step with all three [J]
         self.runaways: Counter[int] = Counter()  # steps by body
         self.events = EventCounts()
+        self._halved: set[int] = set()  # bodies of which it was said
         self._has_listeners = False
         self._due = {"steps": 0.0, "state": 0.0, "status": 0.0, "look": 0.0}
         self._has_viewers = False
@@ -233,6 +234,7 @@ class Telemetry:
             if name in ("", body.name):
                 self.runaways.pop(body.index, None)
                 self.events.clear(body.index)
+                self._halved.discard(body.index)
                 self._not_finite.discard(body.name)
         self.contact.on_reset()
         if self.replay_recorder:
@@ -383,6 +385,19 @@ class Telemetry:
                     "linearizations or the scheme backward_euler may help"
                 )
         self.runaways.update(away["body"].tolist())
+        return lines
+
+    def halved(self, records: NDArray[Any]) -> list[str]:
+        """Returns a line for each object whose step was made again by short ones for the first time."""
+        lines = []
+        for r in records[records["halvings"] > 0]:
+            body = self.simulation.world.bodies[int(r["body"])]
+            if body.index not in self._halved:
+                self._halved.add(body.index)
+                lines.append(
+                    f"object {body.name!r}, step {int(r['step'])}: ran away; made again by {2 ** int(r['halvings'])} "
+                    "short steps, as the next ones are; further ones are counted"
+                )
         return lines
 
 

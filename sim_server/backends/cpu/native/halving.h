@@ -41,9 +41,11 @@ static double elastic_of(const Loop& loop, int index) {
     return sum;
 }
 
-// Whether the body runs away in the step as it is now. elastic: its elastic energy counts, too.
-static bool ran_away(const Loop& loop, int index, bool elastic) {
+// Whether the body runs away in the step as it is now. elastic: its elastic energy counts, too. whole: it is one step, not the sum of
+// short ones, which may be as long as it is.
+static bool ran_away(const Loop& loop, int index, bool elastic, bool whole) {
     Balance b = loop.energies->balance[index];
+    if (!whole) b.limit = INFINITY;
     update_balance(b, sums_of(loop, loop.body[index], true), GO_ON, loop.energies->inertia);
     if (b.found || !elastic || b.budget != b.budget) return b.found;
     const double slow = loop.rings.dt * std::sqrt(2 * b.floor / b.mass);  // SLOW times the size
@@ -133,7 +135,7 @@ static int make_again(Loop& loop, int index, int first, bool elastic) {
     for (int k = 0; k < h.arrays; ++k) copy_nodes(body, h.room + k * room, h.array[k]);
     h.result[index] = SolveResult{0, 0, 0, CONVERGED, body.now.kind, 0, 0, 0};
     for (int level = first; level <= h.levels; ++level)
-        if (make_short_steps(loop, index, level) && !ran_away(loop, index, elastic)) {
+        if (make_short_steps(loop, index, level) && !ran_away(loop, index, elastic, false)) {
             begin_next(loop, index);
             return level;
         }
@@ -150,7 +152,7 @@ static void halve_steps(Loop& loop) {
         if (loop.energies->balance[i].phase == FROZEN) continue;
         const bool goes_on = s.left > 0, elastic = s.left >= 0;
         if (!elastic) ++s.left;
-        if (!goes_on && !ran_away(loop, i, elastic)) {
+        if (!goes_on && !ran_away(loop, i, elastic, true)) {
             if (s.patience && ++s.calm >= CALM) s.patience = s.calm = 0;
             continue;
         }
