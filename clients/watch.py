@@ -43,9 +43,8 @@ def tables(status: pb.Status) -> Group:
     local = [_local(status)] if status.local_workers else []
     pace = [Text(status.pace, "bold red")] if status.pace else []
     return Group(
-        _summary(status), *pace, _objects(status), *_errors(status), *_contacts(status), *_readings(status),
-        *_energies(status),
-        _workers(status), *local,
+        _summary(status), *pace, _objects(status), *_events(status), *_errors(status), *_contacts(status),
+        *_readings(status), *_energies(status), _workers(status), *local,
     )  # fmt: skip
 
 
@@ -97,6 +96,18 @@ def places(status: pb.Status) -> Table:
 def _status(found: pb.ObjectStatus) -> Text:
     away = found.last.status == pb.RUNAWAY
     return Text("RUNAWAY", style="bold red") if away else Text(status_name(found.last.status))
+
+
+def _events(status: pb.Status) -> list[Table]:
+    """Table of what went wrong so far, of the objects where something did; empty without such objects."""
+    table = Table("object", "steps", "factors", "why the last one was refused", **COMPACT)
+    for found in status.objects:
+        steps = ", ".join(f"{e.event} {e.steps}" for e in found.events)
+        counts = {"mended": found.factors_mended, "refused": found.factors_refused}
+        factors = ", ".join(f"{name} {count}" for name, count in counts.items() if count)
+        if steps or factors:
+            _add(table, found.object, steps or "-", factors or "-", found.refusal or "-")
+    return [table] if table.row_count else []
 
 
 def _errors(status: pb.Status) -> list[Table]:

@@ -11,7 +11,7 @@ push    service/commands.py carries it out on effects/touch.py, which calls `upd
 record  service/telemetry.py fetches those of the engine (`records`) for recording/recorder.py and network/publishers.py
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from sim_server import backends
 from sim_server.backends.base import Backend, Capability, EngineInput, Launch, PendingUpdate
 from sim_server.backends.compiler import ahead
+from sim_server.backends.halving import Halving
 from sim_server.backends.kinds import FACTOR_TRUST, WARPED_TRUST, Kind
 from sim_server.backends.measured import Measured
 from sim_server.backends.rank_one import RankOne
@@ -29,6 +30,7 @@ from sim_server.effects import effect
 from sim_server.effects._base import Effect, Refusal
 from sim_server.errors import DeviceError, InputError
 from sim_server.mechanics.energy import collected_energies
+from sim_server.mechanics.halving import check_memory, halving, time_steps
 from sim_server.mechanics.rosenbrock import RosenbrockIntegrator, make_integrator
 from sim_server.mechanics.shape_matching import ShapeMatching
 from sim_server.mechanics.static_check import check_held
@@ -128,8 +130,13 @@ class Simulation:
         euler = self.integrator.euler_form(
             [*assemble, *integrate], assemble[numbers], euler_launches, settled, effects
         )  # fmt: skip
-        parts = [part.launches for part in (stages, euler, substeps) if part]
-        history = [launch for e in effects for launch in e.history()]
+        histories = [(e.name, e.history()) for e in effects]
+        history = [launch for _, launches in histories for launch in launches]
+        short = None
+        if self.energies.on_runaway == "halve":
+            check_memory(histories)
+            short = self._halving(mailed, effects)
+        parts = [part.launches for part in (stages, euler, substeps, short) if part]
         listed = (*history, *assemble, *integrate, *(x for p in parts for x in p))
         self.step_launches = list({id(x): x for x in listed}.values())
         contact = ties_alone(w, self.ties) if self.ties else None
@@ -140,8 +147,17 @@ class Simulation:
         return EngineInput(
             assemble, integrate, names, ranges, w.dt, self.scene.solver, self.energies, newton, stages, euler, substeps,
             contact, touch, held, self.scene.accuracy is not None, self._rank_one(), arrays, history,
-            self.cutting.cut_input() if self.cutting else None, self.measured,
+            self.cutting.cut_input() if self.cutting else None, self.measured, short,
         )  # fmt: skip
+
+    def _halving(self, mailed: Mapping[str, Launch], effects: list[Effect]) -> Halving:
+        """Returns the short steps of bodies that ran away. mailed: launches that all lists share, by name."""
+        assemble, advance = [], []
+        for dt in time_steps(self.world):
+            with self.world.made_with(dt, dt, usual_tangent=False):
+                assemble.append([mailed.get(x.name, x) for x in self.launches(detect=False, euler=True)[0]])
+                advance.append(self.system.advance(self.integrator.before))
+        return halving(self.integrator, assemble, advance, effects)
 
     def _rank_one(self) -> RankOne | None:
         """Returns the parts of A beside its blocks; one effect at most has some."""

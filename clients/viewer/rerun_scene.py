@@ -3,7 +3,8 @@
 
 /world/OBJECT holds the surface, /world/OBSTACLE too, /plots/QUANTITY/OBJECT a curve, /plots/energy/KIND/OBJECT and
 /plots/estimate/KIND/OBJECT curves of energies and estimated errors, /plots/reading/QUANTITY/WHAT of OBJECT curves of
-what effects tell, as the pressure of a cavity; timelines are `step` and `time` (simulated).
+what effects tell, as the pressure of a cavity, /events/OBJECT what went wrong; timelines are `step` and `time`
+(simulated).
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
+from clients.log.events import Events
 from clients.log.frames import Frame, Mesh
 from clients.log.obstacles import Obstacle, ObstacleFrame, Pose
 from clients.log.scalars import REACTION, READING, Columns
@@ -48,6 +50,7 @@ class RerunScene:
         self._top, self._grow = top, grow
         self._has_contact = False
         self._quantities: dict[str, None] = {}  # of readings
+        self._events: dict[str, Events] = {}
         self._low = np.full(3, np.inf)
         self._high = np.full(3, -np.inf)
         recording.log("world", rr.ViewCoordinates.RIGHT_HAND_Y_UP, static=True)
@@ -128,6 +131,7 @@ class RerunScene:
             self._quantities[quantity] = None
             known = np.isfinite(scalars[column])
             self._curve(f"reading/{quantity}", f"{of} of {name}", scalars, scalars[column], known)
+        self._tell(name, scalars)
         if step_time:
             self._curve("step_time", "all", scalars, scalars["step_seconds"] * 1e3, np.ones(len(age), bool))
 
@@ -143,7 +147,8 @@ class RerunScene:
         bodies = rrb.Vertical(
             rrb.Spatial3DView(origin="/world", name="bodies", eye_controls=eye),
             rrb.TextDocumentView(origin="/legend", name="colour"),
-            row_shares=[8, 1],
+            rrb.TextLogView(origin="/events", name="what went wrong"),
+            row_shares=[8, 1, 1],
         )
         plotted = PLOTS | CONTACT_PLOTS if self._has_contact else PLOTS
         plotted = plotted | {f"reading/{quantity}": f"{quantity} [SI unit]" for quantity in self._quantities}
@@ -158,6 +163,14 @@ class RerunScene:
             rrb.TimePanel(state="collapsed", timeline="time"),
             auto_views=False,
         )
+
+    def _tell(self, name: str, scalars: Columns) -> None:
+        """Logs a line at each step in which what goes wrong changes."""
+        for event in self._events.setdefault(name, Events()).changes(scalars):
+            self._recording.set_time("step", sequence=event.step)
+            self._recording.set_time("time", duration=event.time)
+            level = rr.TextLogLevel.WARN if event.wrong else rr.TextLogLevel.INFO
+            self._recording.log(_entity("events", name), rr.TextLog(event.text, level=level))
 
     def _contact(self, name: str, scalars: Columns) -> None:
         """Logs what a run with obstacles has beside the others."""

@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from sim_server.backends.energies import Energies
     from sim_server.backends.euler_form import EulerForm
     from sim_server.backends.measured import Measured
+    from sim_server.backends.halving import Halving
     from sim_server.backends.newton import Newton
     from sim_server.backends.rank_one import RankOne
     from sim_server.backends.rosenbrock import Rosenbrock
@@ -343,6 +344,7 @@ class EngineInput:
     history: launches that begin every step, once, whatever attempts, trials or stages it takes
     cut: of bodies that may lose elements; None: no object lists the effect
     measured: numbers that records come with, in the order of bodies
+    halving: short steps of bodies that ran away; None: these are frozen, or go on
     """
 
     assemble: Sequence[Launch]
@@ -365,6 +367,7 @@ class EngineInput:
     history: Sequence[Launch] = ()
     cut: CutInput | None = None
     measured: Sequence[Measured] = ()
+    halving: Halving | None = None
 
 
 @dataclass(frozen=True)

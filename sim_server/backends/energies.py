@@ -17,6 +17,7 @@ from sim_server.scene.solver_options import OnRunaway
 CODES: dict[OnRunaway | None, int] = {  # None: bodies are not watched at all
     "freeze": ON_RUNAWAY["FREEZE"],
     "go_on": ON_RUNAWAY["GO_ON"],
+    "halve": ON_RUNAWAY["FREEZE"],  # what short steps do not help
     None: ON_RUNAWAY["UNWATCHED"],
 }
 
@@ -64,6 +65,11 @@ class Energies:
     balance: NDArray[Any]
     inertia: bool
     on_runaway: OnRunaway | None
+
+    @property
+    def freezes(self) -> bool:
+        """True if a body that runs away is frozen, at the latest after its step was made again."""
+        return self.on_runaway in ("freeze", "halve")
 
     def parts(self, elements: ElementEnergies) -> Int32:
         """Returns where the elements of each body begin, (bodies + 1,)."""

@@ -19,6 +19,11 @@ Rotation of an element:
 
 Both are exact for rigid motion and agree for small strains.
 
+A crushed body may come to rest with elements inside out. W has equilibria there: stretches such as (2, 2, -1) have the
+sum 3 of no strain, which is all that lambda sees, so the more so the nearer Poisson's ratio is to 1/2 (how often:
+docs/bench/hard_cases.md). No rule takes them back: less lambda while an element is inverted adds energy each time that
+it turns, and runs away from 0.49 on; a term of J^2 below J = 0 is stiffer than the tangent knows.
+
 Tangent: "usual" as above. "exact" adds how R turns with x; in terms of F, with the eigenvectors u and
 eigenvalues h (sums of two stretches) of tr(S) I - S, the twists t have the eigenvalues e of d2W/dF2::
 

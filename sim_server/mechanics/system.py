@@ -168,10 +168,10 @@ class System:
         return [rollers.keep_force(self.b), *([rollers.keep_frame(self.mean)] if frames else [])]
 
     def advance(self, before: Float64) -> Launch:
-        """Advances by backward Euler: v += R y, x += h v. before (n, 3): gets x at the start of the step [m]."""
+        """Advances by backward Euler: v += R y, x += dx_dv v. before (n, 3): gets x at the start of the step [m]."""
         w = self.world
         return self.world.backend.module("kernels/nodes.cu").bind(
-            "advance", w.nodes, rotation=self.rotation, y=self.y, h=w.dt, dv=self.dv, v=w.v, x=w.x, before=before,
+            "advance", w.nodes, rotation=self.rotation, y=self.y, h=w.dx_dv, dv=self.dv, v=w.v, x=w.x, before=before,
         )  # fmt: skip
 
     def couples(self, first: int, last: int) -> bool:

@@ -30,8 +30,8 @@ from sim_server.scene.solver_options import FACTORS
 
 COMPARED = (
     "iterations", "residual", "status", "kind", "fallbacks", "factor_step", "linearizations", "form", "estimate",
-    "kinetic", "work", "contacts", "passes", "clipped", "contact_residual", "substeps", "solve_error",
-    "step_error",
+    "kinetic", "work", "contacts", "passes", "clipped", "contact_residual", "substeps", "halvings",
+    "solve_error", "step_error",
 )  # fmt: skip
 INPUTS = ("step", "asked", "probe")
 ROW = np.dtype([(name, "f8" if RECORD[name].kind == "f" else "i8") for name in (*INPUTS, *COMPARED)])

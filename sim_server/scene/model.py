@@ -24,6 +24,7 @@ from sim_server.mesh import Mesh, bar, check, read
 from sim_server.scene.accuracy_options import MOST_LINEARIZATIONS, ROUNDING, AccuracyOptions
 from sim_server.scene.effect_tables import checked_effects
 from sim_server.scene.elements import Elements, element_errors, keeps_mid_nodes
+from sim_server.scene.halving import check_halving
 from sim_server.scene.holders import Holder, check_holders_on, holder_errors
 from sim_server.scene.integrator_options import IntegratorOptions
 from sim_server.scene.live import Live
@@ -262,6 +263,12 @@ class Scene(Parameters):
                 f"solver.budget = {self.solver.budget:g} with contact and integrator.scheme = "
                 f'"{self.integrator.scheme}", which may make a step twice; allowed: "backward_euler"'
             )
+        return self
+
+    @model_validator(mode="after")
+    def _halving(self) -> "Scene":
+        listed = {"contact": "contact" in self.effects, "holders": self.holders}
+        check_halving(self.solver, self.integrator, listed | {"attachments": self.attachments, "springs": self.springs})
         return self
 
     @model_validator(mode="after")

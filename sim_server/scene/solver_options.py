@@ -55,7 +55,7 @@ def _preconditioner(value: Any) -> str:
 
 Rule = Literal["excess", "round_robin"]
 Precision = Literal["float64", "mixed", "float32"]
-OnRunaway = Literal["freeze", "go_on"]
+OnRunaway = Literal["freeze", "go_on", "halve"]
 FactorPrecision = Literal["auto", "float16", "float32", "float64"]
 _ALLOWED: dict[str, dict[str, tuple[str, ...]]] = {  # values by option and device
     "preconditioner": {
@@ -63,6 +63,7 @@ _ALLOWED: dict[str, dict[str, tuple[str, ...]]] = {  # values by option and devi
         "gpu": tuple(p for p in PRECONDITIONERS if p not in CPU_ONLY),
     },
     "precision": {"cpu": ("float64",), "gpu": ("float64", "mixed", "float32")},
+    "on_runaway": {"cpu": get_args(OnRunaway), "gpu": ("freeze", "go_on")},
     "factor_precision": {"cpu": ("auto", "float32", "float64"), "gpu": ("auto", "float16", "float32")},
 }
 

@@ -27,6 +27,7 @@ from sim_server.recording.replay_recorder import ReplayRecorder
 from sim_server.service.commands import Commands
 from sim_server.service.contact_telemetry import ContactTelemetry
 from sim_server.service.cuts import CutTelemetry
+from sim_server.service.event_counts import EventCounts
 from sim_server.service.reaction_telemetry import ReactionTelemetry
 from sim_server.simulation import Simulation
 from sim_server.updates.driver import Driver
@@ -81,6 +82,8 @@ class Telemetry:
         self.unconverged: Counter[str] = Counter()  # solves by status, of those that did not converge
         self._energy: dict[int, float] = {}  # by body, kinetic + elastic + gravity of the last step with all three [J]
         self.runaways: Counter[int] = Counter()  # steps by body
+        self.events = EventCounts()
+        self._halved: set[int] = set()  # bodies of which it was said
         self._has_listeners = False
         self._due = {"steps": 0.0, "state": 0.0, "status": 0.0, "look": 0.0}
         self._has_viewers = False
@@ -150,6 +153,7 @@ class Telemetry:
         ends = [*first[1:].tolist(), len(order)]
         newest = order[np.array(ends) - 1]
         self._last[present] = records[newest]
+        self.events.add(records)
         if reactions is not None and reactions.any:
             for body, record in zip(present.tolist(), newest.tolist(), strict=True):
                 self._last_reactions[body] = reactions, record
@@ -239,6 +243,8 @@ class Telemetry:
         for body in world.bodies:
             if name in ("", body.name):
                 self.runaways.pop(body.index, None)
+                self.events.clear(body.index)
+                self._halved.discard(body.index)
                 self._not_finite.discard(body.name)
         self.contact.on_reset()
         if self.replay_recorder:
@@ -332,6 +338,7 @@ class Telemetry:
                     total_energy=self._energy.get(body.index),
                     clipped=self.contact.clipped[body.index],
                     crowded=self.contact.crowded[body.index],
+                    events=self.events.of(body.index),
                 )
             )
         status.obstacles.extend(pose_messages(self.simulation, status.step, fixed=True))
@@ -383,7 +390,7 @@ class Telemetry:
         for r in away[np.unique(away["body"], return_index=True)[1]]:
             body = self.simulation.world.bodies[int(r["body"])]
             if body.index not in self.runaways:
-                frozen = self.simulation.energies.on_runaway == "freeze"
+                frozen = self.simulation.energies.freezes
                 then = "it is frozen where the step began" if frozen else "it goes on"
                 lines.append(
                     f"object {body.name!r}, step {int(r['step'])}: runaway: {cause_of(r)}; {then} "
@@ -391,6 +398,19 @@ class Telemetry:
                     "linearizations or the scheme backward_euler may help"
                 )
         self.runaways.update(away["body"].tolist())
+        return lines
+
+    def halved(self, records: NDArray[Any]) -> list[str]:
+        """Returns a line for each object whose step was made again by short ones for the first time."""
+        lines = []
+        for r in records[records["halvings"] > 0]:
+            body = self.simulation.world.bodies[int(r["body"])]
+            if body.index not in self._halved:
+                self._halved.add(body.index)
+                lines.append(
+                    f"object {body.name!r}, step {int(r['step'])}: ran away; made again by {2 ** int(r['halvings'])} "
+                    "short steps, as the next ones are; further ones are counted"
+                )
         return lines
 
 

@@ -33,7 +33,7 @@ class SolveObserver:
     def observe(self, records: NDArray[Any]) -> None:
         """Sums up records of the loop, in their order."""
         states = self._driver.bodies
-        if self._driver.simulation.energies.on_runaway == "freeze":
+        if self._driver.simulation.energies.freezes:
             for body in np.unique(records["body"][records["status"] == RUNAWAY]):
                 states[body].frozen = True
         whole_steps = len(records) >= max(len(states), MIN_TOGETHER) and len(records) % len(states) == 0

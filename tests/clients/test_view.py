@@ -104,6 +104,8 @@ def test_rrd_curves(log: Log, tmp_path: Path) -> None:
     assert curve("energy/kinetic/beam") == [(s.step, 10.0 * s.step) for s in steps[1:]]
     assert curve("energy/elastic/beam") == [(s.step, 3.0 + s.step) for s in steps if s.step % 3 == 0]
     assert curve("energy/dissipated/beam") == [(s.step, 0.25 * s.step) for s in steps if s.step % 3 == 0]
+    told = [(step, values) for step, _, (values,) in rrd.column("/events/beam", "text")]
+    assert told == [(4, "max_iterations"), (5, "converged again")]
     assert len(curve("energy/work/beam")) == len(curve("energy/gravity/beam")) == len(steps) - 1
 
 

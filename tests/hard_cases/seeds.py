@@ -15,12 +15,16 @@ from tests.hard_cases.starts import randomly_placed
 BACK, ELSEWHERE, INVERTED, FLOWN = "back at rest", "elsewhere, J > 0", "J <= 0 somewhere", "flown apart"
 SPLITS = ("kuhn", "mirrored")
 STABLE = {"stable_neo_hookean": ELASTIC}
-SEEDED: dict[str, tuple[Table, str]] = {  # effects, projection
+SMOOTHED = {
+    f"corotational, smoothed, {nu}": ({"corotational": ELASTIC | {"poisson": nu}}, "auto") for nu in (0.45, 0.49)
+}
+SEEDED: dict[str, tuple[Table, str]] = {  # effects, projection; linear elements, but for those of SMOOTHED
     **{f"corotational, {nu}": ({"corotational": ELASTIC | {"poisson": nu}}, "auto") for nu in (0.3, 0.45, 0.49)},
     "stable_neo_hookean": (STABLE, "auto"),
     "stable_neo_hookean, clamp": (STABLE, "clamp"),
     "stable_neo_hookean, absolute": (STABLE, "absolute"),
     "neo_hookean, regularized": ({"neo_hookean": ELASTIC | {"inversion": "regularize"}}, "auto"),
+    **SMOOTHED,
 }
 
 
@@ -32,7 +36,8 @@ def fate(name: str, split: str, seed: int, cells: tuple[int, int, int] = (3, 3, 
     """
     effects, projection = SEEDED[name]
     mesh = {"bar": list(cells), "size": [1, 1, 4], "split": split}
-    tables = {"effects.rayleigh.mass": 1, "mesh": mesh} | {f"effects.{k}": table for k, table in effects.items()}
+    tables = {"effects.rayleigh.mass": 1, "mesh": mesh, "elements": "smoothed" if name in SMOOTHED else "linear"}
+    tables |= {f"effects.{k}": table for k, table in effects.items()}
     overrides = [f"object.bar.{key}={toml(value)}" for key, value in tables.items()]
     sim = Simulation.load(MODELS_BAR, [*overrides, f"solver.projection={projection}"])
     rest, length = sim.world.x.copy(), float(np.ptp(sim.world.x))

@@ -4,6 +4,7 @@
 import io
 from types import SimpleNamespace
 
+import numpy as np
 from rich.console import Console
 
 from clients.watch import tables
@@ -38,6 +39,25 @@ def test_the_client_shows_these_numbers():
     assert "no log any more" not in text.getvalue()
     Console(width=200, file=text).print(tables(pb.Status(recording_failure="/x.mcap: No space left on device")))
     assert "no log any more: /x.mcap: No space left on device" in text.getvalue()
+
+
+def test_what_goes_wrong_is_counted_by_object_and_shown():
+    """One iteration does not solve a stiff bar; gravity of no number ends in not_finite."""
+    sim, found = simulation(bar(young=1e5), gravity=(0, -9.81, 0), max_iterations=1), []
+    driver = Driver(sim)
+    telemetry = Telemetry(driver, SimpleNamespace(publish_status=found.append), None, patient=False)  # type: ignore[arg-type]
+    telemetry.update_summary(driver.advance(3))
+    sim.world.v[:] = np.nan
+    telemetry.update_summary(driver.advance(1))
+    telemetry.publish_status("running")
+    counts = {e.event: e.steps for e in found[0].objects[0].events}
+    assert counts == {"max_iterations": 3, "not_finite": 1}
+    text = io.StringIO()
+    Console(width=200, file=text).print(tables(found[0]))
+    assert "max_iterations 3, not_finite 1" in text.getvalue()
+    telemetry.events.clear(0)
+    telemetry.publish_status("running")
+    assert not found[1].objects[0].events
 
 
 def test_the_client_shows_the_workers_that_the_server_supervises():

@@ -25,6 +25,7 @@ from sim_server.backends.contact import Contact, OwnSurfaces, Surfaces
 from sim_server.backends.cpu import structs
 from sim_server.backends.cpu.device import CpuLaunch
 from sim_server.backends.cpu.energies import NativeEnergies
+from sim_server.backends.cpu.halving import NativeHalving
 from sim_server.backends.euler_form import EulerForm
 from sim_server.backends.newton import Newton
 from sim_server.backends.rank_one import RankOne
@@ -442,7 +443,7 @@ class CpuEngine(Reports):
 
     def __init__(self, given: EngineInput, records: int = 8192, frames: int = 8):
         self._native = _library()
-        others = [part.launches for part in (given.stages, given.euler, given.substeps) if part]
+        others = [part.launches for part in (given.stages, given.euler, given.substeps, given.halving) if part]
         listed = cast(
             list[CpuLaunch], [*given.assemble, *given.integrate, *(x for part in others for x in part), *given.history]
         )
@@ -483,6 +484,9 @@ class CpuEngine(Reports):
         self._stages = given.stages and _NativeStages(given.stages, loop, self._launch, number)
         self._euler = given.euler and _NativeEuler(given.euler, loop, self._launch, number)
         self._substeps = given.substeps and _NativeSubsteps(given.substeps, loop, number)
+        self._halving = given.halving and NativeHalving(given.halving, loop, number)
+        if given.halving:
+            _tell_bodies_apart(given.halving.parts, self._launch, number)
         self._contact = given.contact and _NativeContact(given.contact, loop, arrays)
         if self._contact and given.euler:  # bodies whose step is made have the velocities of its end
             self._contact.native.predictor = given.euler.start_v.ctypes.data
@@ -562,7 +566,8 @@ class CpuEngine(Reports):
 
     def state(self) -> list[StateArray]:
         """Returns what native code carries on beside the arrays that launches write."""
-        parts = [part.state() for part in (self._stages, self._euler, self._substeps, self._contact) if part]
+        listed = (self._stages, self._euler, self._substeps, self._halving, self._contact)
+        parts = [part.state() for part in listed if part]
         corrections = [self._state_of_correction(k) for k in self._corrections]
         own = [
             host_array("engine.balance", self._energies.balance.view(np.uint8), resets=False),

@@ -178,6 +178,16 @@ class CentralDifference(c.Structure):
 
 
 @LOOP.struct
+class ShortSteps(c.Structure):
+    """State of a body whose steps are made of short ones."""
+
+
+@LOOP.struct
+class Halving(c.Structure):
+    """Input and memory of steps that are made again by short ones."""
+
+
+@LOOP.struct
 class Elastic(c.Structure):
     """Energies of the elements of an effect."""
 

@@ -72,7 +72,9 @@ SEEDS_ABOUT = """\
 The bar of 648 tetrahedra, split in two ways, every free node anywhere in the bounding box: how many of {seeds} seeds
 end how after 14 s (Rayleigh damping 1/s; tests/hard_cases/seeds.py). *back at rest*: within 0.001 L; *elsewhere,
 J > 0*: no element inverted, but folded through itself (there is no contact), or still in motion; *flown apart*: not
-finite or ten lengths away. What follows a comma is Poisson's ratio, 0.45 elsewhere, or `[solver] projection`.
+finite or ten lengths away. What follows a comma is Poisson's ratio, 0.45 elsewhere, `[solver] projection`, or the kind
+of elements, linear elsewhere. *corotational* stays inside out where that is an equilibrium: lambda sees the sum of the
+stretches alone, which an element turned inside out may have, too (effects/corotational.py).
 """
 
 

@@ -96,7 +96,11 @@ static void account(Loop& loop, bool elastic) {
     Energies& e = *loop.energies;
 #pragma omp parallel for num_threads(loop.threads) schedule(dynamic, 1) if (loop.threads > 1 && loop.bodies > 1)
     for (int i = 0; i < loop.bodies; ++i) {
-        const bool frozen = update_balance(e.balance[i], sums_of(loop, loop.body[i]), e.on_runaway, e.inertia);
+        Balance& b = e.balance[i];
+        const double limit = b.limit;
+        if (loop.halving && loop.halving->made[i]) b.limit = INFINITY;  // short steps make it up
+        const bool frozen = update_balance(b, sums_of(loop, loop.body[i]), e.on_runaway, e.inertia);
+        b.limit = limit;
         if (frozen) freeze(loop, loop.body[i]);
     }
     if (elastic) measure_elastic(loop);

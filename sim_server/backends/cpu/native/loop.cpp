@@ -9,6 +9,7 @@
 #include "energy.h"
 #include "euler_form.h"
 #include "faces.h"
+#include "halving.h"
 #include "newton.h"
 #include "newton_contact.h"
 #include "pair_reactions.h"
@@ -270,6 +271,7 @@ static void finish_step(Loop* loop) {
         SolveSettings& now = loop->body[i].now;
         now.deadline = now.step_budget > 0 ? begun + now.step_budget : 0;
     }
+    if (loop->halving) remember_start(*loop);
     if (loop->substeps) make_substeps(*loop);
     if (loop->euler) make_step(*loop);
     else if (loop->newton && loop->contact) search_in_contact(*loop);
@@ -323,6 +325,7 @@ static void finish_step(Loop* loop) {
     }
     double solved = now();
     for (int i = loop->before; i < loop->launches && !loop->euler; ++i) run(loop->launch[i], loop->threads);
+    if (loop->halving) halve_steps(*loop);
     if (loop->energies) account(*loop, energy_due(rings, step));
     double end = now(), cpu = thread_time() - loop->cpu_begin;
     ++rings.step;
@@ -333,6 +336,7 @@ static void finish_step(Loop* loop) {
             record.integrate = end - solved;
             record.whole = end - loop->assemble_begin - waited;  // with a factorization that the step waited for
             record.cpu = cpu;
+            if (loop->halving) note_halving(*loop->halving, i, record);
             if (loop->energies) note_energy(record, loop->energies->balance[i]);
             if (loop->holders) note_holders(*loop, i, (first + i) % rings.record_capacity);
             if (loop->measured) note_readings(*loop, i, (first + i) % rings.record_capacity);
@@ -417,7 +421,7 @@ void wf_precondition(Loop* loop, int32_t index, const double* r, double* z, doub
 const StructSize* wf_sizes() {
     static const StructSize sizes[] = {SIZE(Launch), SIZE(Body), SIZE(Loop), SIZE(Factor), SIZE(KnownContact), SIZE(Pattern), SIZE(Record),
                                        SIZE(Newton), SIZE(Search), SIZE(Stages), SIZE(StageState), SIZE(EulerForm), SIZE(Elastic), SIZE(Energies), SIZE(Balance),
-                                       SIZE(Contact), SIZE(RowState), SIZE(PassChoice), SIZE(OwnReference), SIZE(ContactReport), SIZE(Box), SIZE(Reaction), SIZE(CentralDifference), SIZE(StableStep), SIZE(Copy), SIZE(Changes), {}};
+                                       SIZE(Contact), SIZE(RowState), SIZE(PassChoice), SIZE(OwnReference), SIZE(ContactReport), SIZE(Box), SIZE(Reaction), SIZE(CentralDifference), SIZE(Halving), SIZE(ShortSteps), SIZE(StableStep), SIZE(Copy), SIZE(Changes), {}};
     return sizes;
 }
 }

@@ -157,6 +157,32 @@ struct Energies {                      // energy.h
     int32_t begun;                     // the energy before the first step is known
 };
 
+struct ShortSteps {                    // of a body that ran away (halving.h)
+    int32_t level;                     // its steps are made of 2^level short ones
+    int32_t left;                      // for so many steps to come; below 0: the elastic energy does not count for so many
+    int32_t patience;                  // and for so many when it ran away last
+    int32_t calm;                      // steps without since
+};
+
+struct Halving {                       // halving.h
+    int32_t levels, launches;          // most halvings; launches that assemble a short step
+    const int32_t* launch;             // (levels, launches) their numbers
+    const int32_t* advance;            // (levels,) number of the launch that ends it
+    int32_t end;                       // number of the launch that begins the next step of the scheme; -1: there is nothing to begin
+    double* coefficients;              // (2,) of launches whose arguments change while steps run
+    double own_coefficients[2];
+    double *start_x, *start_v;         // (nodes, 3) at the start of the step
+    double* before;                    // (nodes, 3) gets x when the step begins
+    double *predictor, *damping_velocity, *inertial_increment;  // (nodes, 3), or null: the scheme is backward Euler
+    const double* rotation;            // (nodes, 3, 3)
+    double** array;                    // (arrays,) (nodes, 3) that a step leaves
+    int32_t arrays;
+    double* room;                      // (arrays, nodes, 3)
+    ShortSteps* state;                 // (bodies,)
+    int32_t* made;                     // (bodies,) halvings of the step
+    SolveResult* result;               // (bodies,) of its short steps
+};
+
 struct Loop {
     int32_t launches, before;          // launches; how many of them assemble (the others integrate)
     Launch* launch;
@@ -185,6 +211,7 @@ struct Loop {
     const double* held_reaction;       // (bodies, holders, 6) force [N] and torque [N m] on each; launches that integrate set it
     double** measured;                 // where the numbers are that records come with, or null
     const int32_t* measured_first;     // (bodies + 1,) of each body
+    Halving* halving;                  // null: a body that runs away is frozen, or goes on
     double* clock;                     // (1,) s, read by kernels
     int32_t* moving;                   // (bodies,) 0: the body rests (kernels/nodes.cu)
     Energies* energies;                // or null

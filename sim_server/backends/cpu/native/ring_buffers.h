@@ -47,6 +47,7 @@ struct Record {
     int32_t contacts = 0;       // that carry force
     int32_t passes = 0;         // solves for them
     int32_t clipped = 0;        // nodes held back at an obstacle beside the law
+    int32_t halvings = 0;       // the step was made again by 2^halvings short ones; 0: it was not
     int32_t substeps = 0;       // explicit ones of the step; 0: an implicit scheme
     double stable_step = NAN;   // largest stable substep as estimated last [s]; NaN: an implicit scheme
     double solve_error = NAN;   // estimated, of the positions, by the last linear solve, largest of a node [m]; NaN: not known
