@@ -225,3 +225,14 @@ def test_a_body_that_cannot_be_cut_turns_beside_one_that_can_as_it_does_alone():
         sim.engine.run(10)
     rotation = beside.system.rotation[beside.world.body("solid").nodes]
     np.testing.assert_allclose(rotation, alone.system.rotation, atol=1e-12)
+
+
+def test_a_body_that_may_be_cut_falls_on_a_floor_beside_one_that_may_not():
+    """The one touches with its nodes alone, the other with its triangles, too."""
+    found = table(fixed=False, effects={"gravity": {"g": [0, -9.81, 0]}, "contact": {"between": False}})
+    solid = bar(name="solid", cells=(2, 1, 1), pose={"translate": [0, 0, 1]})
+    found |= {"object": [*found["object"], solid], "obstacle": [{"name": "floor", "shape": "plane"}], "solver": {}}
+    sim = Simulation(Scene.model_validate(found, context={"folder": "."}))
+    sim.engine.run(20)
+    assert (sim.engine.records()["contacts"][-2:] > 0).all()
+    assert sim.world.x[:, 1].min() > -1e-3
