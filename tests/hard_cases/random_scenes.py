@@ -225,7 +225,7 @@ def plans(draw: Draw) -> Table:
         "integrator": integrator, "solver": solver, "object": objects,
     }  # fmt: skip
     if scheme == "central_difference":
-        scene["dt"] = 1e-4  # a step has as many substeps as it needs
+        scene["dt"] = 1e-5  # a step has as many substeps as it needs
     if scheme == "quasi_static":
         for each in objects:
             each["effects"].setdefault("fixed", {"where": "X < 1e-6"})
