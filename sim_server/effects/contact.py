@@ -230,6 +230,8 @@ class Contact(Movable):
         weights = np.stack([1 - u - v, u, v], axis=-1)[u + v <= 1 + 1e-9]
         for body in w.bodies:
             triangle = faces.triangle[slice(*(faces.start[body.index : body.index + 2] - faces.start[0]))]
+            if not len(triangle):
+                continue  # it may be cut, and touches with its nodes alone
             points = np.einsum("sa,tak->tsk", weights, w.x[triangle]).reshape(-1, 3)
             distance, nearest = self._distances(np.arange(len(points), dtype=np.int32), points)
             deep = distance.reshape(len(triangle), -1) < -_thickness(self.params, body)

@@ -202,9 +202,9 @@ class Corotational(Effect):
         return [forces, gather, *(self._leave_out(system, stencil, self.near) if frames else [])]
 
     def _leave_out(self, system: System, stencil: Stencil, quaternion: Float64) -> list[Launch]:
-        """Launches that leave removed elements out of the frames of nodes."""
+        """Launches that leave removed elements out of the frames of nodes; none where none of these may be cut."""
         w = self.world
-        if w.without_elements is None:
+        if w.without_elements is None or not any("cutting" in body.effects for body in self.rotated):
             return []
         leave_out: Launch = w.backend.module("effects/corotational_cut.cu").bind(
             "leave_out", w.nodes, start=stencil.corner_start, corners=stencil.corners, present=self.present,

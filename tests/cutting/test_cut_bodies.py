@@ -6,9 +6,11 @@ import pytest
 
 from protocol import messages_pb2 as pb
 from sim_server.errors import InputError
+from sim_server.scene.model import Scene
+from sim_server.simulation import Simulation
 from sim_server.state.start import Start
-from tests.cutting.cut_scenes import HALVED, LAWS, cut, elements, made
-from tests.scenes import mesh_file
+from tests.cutting.cut_scenes import HALVED, LAWS, cut, elements, made, table
+from tests.scenes import bar, mesh_file
 
 NOTCH = "abs(X - 1) < 0.13 and Y > 0.25"
 SCHEMES = {
@@ -207,3 +209,30 @@ def test_bodies_that_touch_each_other_cannot_be_cut():
     with pytest.raises(InputError, match="touch obstacles alone"):
         made(object=[one, two], effects=effects)
     made(object=[one, two], effects=effects | {"contact": {"between": False}}, **FLOOR)
+
+
+def test_a_body_that_cannot_be_cut_turns_beside_one_that_can_as_it_does_alone():
+    """Here the one that can is of another law, so that no element of corotational may be removed."""
+    solid = bar(name="solid", cells=(2, 1, 1), pose={"translate": [0, 5, 0]}, damping=(0.1, 0))
+    found = table("neo_hookean")
+    beside, alone = (
+        Simulation(Scene.model_validate(found | {"object": objects}, context={"folder": "."}))
+        for objects in ([*found["object"], solid], [solid])
+    )
+    for sim in (beside, alone):
+        nodes = sim.world.body("solid").nodes
+        sim.world.v[nodes] = np.cross([0, 0, 5.0], sim.world.x[nodes])
+        sim.engine.run(10)
+    rotation = beside.system.rotation[beside.world.body("solid").nodes]
+    np.testing.assert_allclose(rotation, alone.system.rotation, atol=1e-12)
+
+
+def test_a_body_that_may_be_cut_falls_on_a_floor_beside_one_that_may_not():
+    """The one touches with its nodes alone, the other with its triangles, too."""
+    found = table(fixed=False, effects={"gravity": {"g": [0, -9.81, 0]}, "contact": {"between": False}})
+    solid = bar(name="solid", cells=(2, 1, 1), pose={"translate": [0, 0, 1]})
+    found |= {"object": [*found["object"], solid], "obstacle": [{"name": "floor", "shape": "plane"}], "solver": {}}
+    sim = Simulation(Scene.model_validate(found, context={"folder": "."}))
+    sim.engine.run(20)
+    assert (sim.engine.records()["contacts"][-2:] > 0).all()
+    assert sim.world.x[:, 1].min() > -1e-3

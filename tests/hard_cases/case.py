@@ -38,8 +38,8 @@ class Hold:
 class Case:
     """One line of the table.
 
-    file, scene: scene file and overrides; build: what makes the simulation from the overrides, instead. done: in words;
-    start, hold and source do it. steps: of the run.
+    file, scene: scene file and overrides; build: what makes the simulation from overrides, folder and device, instead.
+    done: in words; start, hold and source do it. steps: of the run.
     rests: where it comes back to: "pose" (no load), "static" (its equilibrium, found by a heavily damped run at another
     time step), "still" (wherever it is at the end), "same" (at every step where the same run without any
     preconditioner, solved to 1e-10, is) or "spin" (nowhere: free). within: distance to it, largest over the nodes /
@@ -59,7 +59,7 @@ class Case:
     start: Start = nothing
     hold: Hold | None = None
     source: Source | None = None
-    build: Callable[[list[str], Path], Simulation] | None = None
+    build: Callable[..., Simulation] | None = None
     steps: int = 400
     rests: Literal["pose", "static", "still", "same", "spin"] = "pose"
     within: float = 1e-3

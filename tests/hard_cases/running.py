@@ -15,10 +15,11 @@ from sim_server.effects.touch import Touch
 from sim_server.simulation import Simulation
 from sim_server.updates.driver import Driver
 from tests.hard_cases.case import Case, Hold
+from tests.state import put
 
 Reals = NDArray[np.float64]
 STATUS = ("converged", "max_iterations", "budget", "breakdown_matrix", "breakdown_preconditioner", "not_finite",
-          "max_linearizations", "runaway")  # fmt: skip
+          "max_linearizations", "runaway", "contact")  # fmt: skip
 
 
 @dataclass
@@ -97,18 +98,38 @@ def finer(case: Case, times: int = 10, steps: int = 150) -> Case:
     return replace(case, scene=scene, hold=hold, steps=times * min(steps, case.steps), rests="spin")
 
 
-def built(case: Case, folder: Path, *more: str) -> Simulation:
+@dataclass(frozen=True)
+class Place:
+    """Where cases run. folder: for files that they write"""
+
+    folder: Path
+    device: str = "cpu"
+    precision: str = "float64"
+
+
+def built(case: Case, place: Place, *more: str) -> Simulation:
     """The case's scene with overrides, before its start."""
-    overrides = [*case.scene, *more]
-    return case.build(overrides, folder) if case.build else Simulation.load(case.file, overrides)
+    overrides = [f"solver.precision={place.precision}", *case.scene, *more]
+    if case.build:
+        return case.build(overrides, place.folder, device=place.device)
+    return Simulation.load(case.file, overrides, place.device)
 
 
-def run_case(case: Case, folder: Path) -> Outcome:
-    """folder: for files that the case writes."""
-    sim = built(case, folder)
-    goal = _goal(case, sim, folder)
-    length = float(np.ptp(sim.world.rest, axis=0).max())
+def begin(case: Case, sim: Simulation) -> None:
+    """Starts a case, on the device."""
     case.start(sim)
+    if sim.world.backend.name == "gpu":
+        for array in (sim.world.x, sim.world.v, sim.world.mass):
+            put(sim, array, array.copy())
+
+
+def run_case(case: Case, folder: Path, device: str = "cpu", precision: str = "float64") -> Outcome:
+    """folder: for files that the case writes."""
+    place = Place(folder, device, precision)
+    sim = built(case, place)
+    goal = _goal(case, sim, place)
+    length = float(np.ptp(sim.world.rest, axis=0).max())
+    begin(case, sim)
     if case.refused:
         return _refused(case, sim, goal)
     driver, load = Driver(sim, case.source(sim) if case.source else None), Load(sim, case.hold)
@@ -117,6 +138,7 @@ def run_case(case: Case, folder: Path) -> Outcome:
         load.before(step)
         x = sim.world.x.copy()
         records.append(driver.advance(1))
+        sim.fetch()
         load.after(x)
         energy.append(_energy(sim) - load.work)
         det.append(float(determinants(sim).min()))
@@ -133,11 +155,12 @@ def _refused(case: Case, sim: Simulation, rest: Reals) -> Outcome:
     """Steps in a state that the model does not define, then as many from rest."""
     driver, x, det = Driver(sim), sim.world.x.copy(), determinants(sim)
     records = driver.advance(case.steps)
-    moved = float(np.abs(sim.world.x - x).max())
-    sim.world.x[:], sim.world.v[:] = rest, 0
+    moved = float(np.abs(sim.fetch().x - x).max())
+    put(sim, sim.world.x, rest)
+    put(sim, sim.world.v, 0)
     named = {r.element for r in sim.refusals()}
     after = driver.advance(case.steps)
-    distance = float(np.abs(sim.world.x - rest).max() / np.ptp(rest))
+    distance = float(np.abs(sim.fetch().x - rest).max() / np.ptp(rest))
     return Outcome(
         finite=bool(np.isfinite(sim.world.x).all()), energy=0.0, rise=0.0, dissipated=0.0,
         status=Counter(STATUS[s] for s in records["status"].tolist()), fallbacks=0,
@@ -158,23 +181,23 @@ def determinants(sim: Simulation) -> Reals:
     return np.linalg.det(now[:, 1:] - now[:, :1]) / np.linalg.det(rest[:, 1:] - rest[:, :1])
 
 
-def _goal(case: Case, sim: Simulation, folder: Path) -> Reals:
+def _goal(case: Case, sim: Simulation, place: Place) -> Reals:
     """(nodes, 3), or (steps, nodes, 3) where every step is compared."""
     if case.rests == "static":
         damped = ("dt=0.1", "object.bar.effects.rayleigh.mass=5", "integrator.scheme=backward_euler")
-        still = built(case, folder, *damped, "solver.update=every-1")
-        case.start(still)
+        still = built(case, place, *damped, "solver.update=every-1")
+        begin(case, still)
         Driver(still).advance(250)
-        assert np.abs(still.world.v).max() < 1e-6, "the reference run did not come to rest"
+        assert np.abs(still.fetch().v).max() < 1e-6, "the reference run did not come to rest"
         return still.world.x.copy()
     if case.rests == "same":
         alone = ("solver.preconditioner=none", "solver.tolerance=1e-10", "solver.max_iterations=10000")
-        other = built(case, folder, *alone)
-        case.start(other)
+        other = built(case, replace(place, precision="float64"), *alone)
+        begin(case, other)
         driver, x = Driver(other), []
         for _ in range(case.steps):
             assert (driver.advance(1)["status"] == 0).all(), "the reference run did not converge"
-            x.append(other.world.x.copy())
+            x.append(other.fetch().x.copy())
         return np.array(x)
     return sim.world.x.copy()
 

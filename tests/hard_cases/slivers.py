@@ -16,7 +16,7 @@ THICKNESS = 1e-3  # of the squeezed layer / cell
 
 
 def sliver_bar(
-    overrides: list[str], folder: Path, file: Path = BAR, cells: tuple[int, int, int] = (3, 3, 12)
+    overrides: list[str], folder: Path, file: Path = BAR, cells: tuple[int, int, int] = (3, 3, 12), device: str = "cpu"
 ) -> Simulation:
     """A scene's bar on that mesh, which goes through a file as a user's would."""
     path = folder / "slivers.vtu"
@@ -25,7 +25,7 @@ def sliver_bar(
     above = rest[:, 2] > (cells[2] // 2 + 0.5) * cell
     rest[above, 2] -= (1 - THICKNESS) * cell
     meshio.write(path, meshio.Mesh(rest, [("tetra", mesh.tets)]))
-    return Simulation.load(file, [f'object.bar.mesh={{ file = "{path}" }}', *overrides])
+    return Simulation.load(file, [f'object.bar.mesh={{ file = "{path}" }}', *overrides], device)
 
 
 def smallest_dihedral(rest: NDArray[np.float64], tets: NDArray[np.int32]) -> float:

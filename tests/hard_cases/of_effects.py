@@ -1,0 +1,148 @@
+# SPDX-License-Identifier: MIT
+"""Runs hard cases of effects: each of several seeds, with one figure that must stay small."""
+
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sim_server.scene.model import Scene
+from sim_server.simulation import Simulation
+from sim_server.updates.driver import Driver
+from tests.hard_cases.running import STATUS
+
+Table = dict[str, Any]
+Reals = NDArray[np.float64]
+Random = np.random.Generator
+SEEDS = 4
+TOLD = {status: 10_000 for status in STATUS}
+
+
+@dataclass
+class Trace:
+    """start, positions (nodes, 3) before the first step and after each, and all records."""
+
+    start: Reals
+    positions: list[Reals]
+    records: NDArray[Any]
+
+    @property
+    def last(self) -> Reals:
+        return self.positions[-1]
+
+    @property
+    def speed(self) -> float:
+        """Largest change of a position in the last step [m]."""
+        return float(np.abs(self.positions[-1] - self.positions[-2]).max())
+
+
+@dataclass(frozen=True)
+class EffectCase:
+    """A line of the table. done, must: in words, must with `most`.
+
+    scene: made from random numbers; begin: changes the state before the first step; act: before each one
+    judge: what must be at most `most`; unconverged: how many steps may end so, by status, of all objects
+    """
+
+    name: str
+    done: str
+    must: str
+    scene: Callable[[Random], Table]
+    judge: Callable[[Simulation, Trace], float]
+    most: float
+    steps: int = 150
+    act: Callable[[Simulation, int], None] = lambda sim, step: None
+    begin: Callable[[Simulation, Random], None] = lambda sim, random: None
+    unconverged: dict[str, int] = field(default_factory=dict)
+    note: str = ""
+
+
+@dataclass(frozen=True)
+class EffectOutcome:
+    """Of one seed. wrong: what had to hold and did not."""
+
+    wrong: tuple[str, ...]
+    value: float
+    status: Counter[str]
+    iterations: Reals
+    note: str = ""
+
+
+def run_effect_case(case: EffectCase, seed: int, device: str = "cpu", precision: str = "float64") -> EffectOutcome:
+    random = np.random.default_rng(seed)
+    table = {"name": "case", "dt": 0.01, **case.scene(random)}
+    usual = {"preconditioner": "cholesky", "update": "lockstep-5", "precision": precision}
+    table["solver"] = usual | table.get("solver", {})
+    sim = Simulation(Scene.model_validate(table, context={"folder": "."}), device)
+    case.begin(sim, random)
+    driver, start, positions, records = Driver(sim), sim.fetch().x.copy(), [], []
+    for step in range(case.steps):
+        case.act(sim, step)
+        records.append(driver.advance(1))
+        positions.append(sim.fetch().x.copy())
+    trace = Trace(start, positions, np.concatenate(records))
+    status = Counter(STATUS[s] if s < len(STATUS) else "contact" for s in trace.records["status"].tolist())
+    value = case.judge(sim, trace)
+    wrong = [] if np.isfinite(trace.last).all() and np.isfinite(sim.world.v).all() else ["not finite"]
+    wrong += [
+        f"{count} steps ended with {name}" for name, count in status.items()
+        if name != "converged" and count > case.unconverged.get(name, 0)
+    ]  # fmt: skip
+    if not value <= case.most:
+        wrong.append(f"{value:.3g}, more than {case.most:g}")
+    return EffectOutcome(tuple(wrong), value, status, trace.records["iterations"].astype(float))
+
+
+def below_floor(sim: Simulation, trace: Trace) -> float:
+    """Deepest place of a node below y = 0 in the run [m]."""
+    return float(-min(x[:, 1].min() for x in trace.positions))
+
+
+def still(sim: Simulation, trace: Trace) -> float:
+    """Largest speed at the end [m/s]; of what is below the floor none."""
+    return speed(sim, trace) if below_floor(sim, trace) < 1e-4 else float("inf")
+
+
+def speed(sim: Simulation, trace: Trace) -> float:
+    """Largest speed in the last step [m/s]."""
+    return trace.speed / sim.world.dt
+
+
+def tells(sim: Simulation, trace: Trace) -> float:
+    """Nothing more than what holds of all."""
+    return 0.0
+
+
+def back_to_rest(sim: Simulation, trace: Trace) -> float:
+    """Largest distance from where it began, over the length."""
+    return float(np.abs(trace.last - trace.start).max() / np.ptp(trace.start, axis=0).max())
+
+
+def of_order(sim: Simulation, trace: Trace) -> float:
+    """Largest amount by which the last object is below the first one in the run [m]."""
+    first, last = (sim.world.bodies[k].nodes for k in (0, -1))
+    return float(max(x[first, 1].mean() - x[last, 1].mean() for x in trace.positions))
+
+
+def passed(sim: Simulation, trace: Trace) -> float:
+    """Largest amount by which the middle of the last object is below the lowest node of the first one [m]."""
+    first, last = (sim.world.bodies[k].nodes for k in (0, -1))
+    return float(max(x[first, 1].min() - x[last, 1].mean() for x in trace.positions))
+
+
+def energy_rise(sim: Simulation, trace: Trace) -> float:
+    """Largest kinetic energy over what the run allows: that at its start and the work of gravity and loads."""
+    found = trace.records
+    known = (found["status"] != STATUS.index("runaway")) & np.isfinite(found["kinetic"])
+    least = 1e-9 * float(np.nanmax(np.abs(found["budget"]))) + 1e-300
+    return float((found["kinetic"][known] / np.maximum(found["budget"][known], least)).max(initial=0.0))
+
+
+def free_fall(sim: Simulation, trace: Trace) -> float:
+    """How far the node that moves most falls other than it should by backward Euler, as a part of that."""
+    n, h = len(trace.positions), sim.world.dt
+    way = 9.81 * h * h * n * (n + 1) / 2
+    return abs(float((trace.start - trace.last)[:, 1].max()) - way) / way
