@@ -33,6 +33,8 @@ SCENES = {
     "beam.toml, float32": ("solver.precision=float32",),
     "beam.toml, Newton": ("integrator.linearizations=3", "integrator.scheme=newmark"),
     "beam.toml, accuracy": ("accuracy.position='1 %'", "solver.precision=mixed"),
+    "beam.toml, budget of a search": ("solver.budget_ms=2", "integrator.linearizations=3", "solver.precision=mixed"),
+    "four_beams.toml, budget of solves": ("solver.budget=1e-3",),
     "floor_drop.toml, accuracy": ("accuracy.position=1e-4",),
     "two_organs.toml, smoothed": ("object.tissue.elements=smoothed", "object.kidney.elements=smoothed"),
     "beam.toml, ros2": ("integrator.scheme=ros2", "solver.preconditioner=cholesky"),

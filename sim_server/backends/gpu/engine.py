@@ -67,8 +67,7 @@ class DeviceSettings:
         return self._row[name].item()
 
     def __setattr__(self, name: str, value: Any) -> None:
-        unknown = ("budget", "omega", "most_linearizations")  # no budget of a solve and no SSOR on a GPU
-        if name in unknown or self._row[name] == value:
+        if name == "omega" or self._row[name] == value:  # no SSOR on a GPU
             return
         self._row[name] = value
         self._mailbox.post(self._row.tobytes()[:SETTINGS_BYTES])
@@ -98,6 +97,8 @@ class GpuEngine(DeviceLoop):
         stages, precision = given.stages, given.solver.factor_precision
         fine = precision == "float32" or (precision == "auto" and stages is not None and stages.factor_alone)
         planes = 2 if fine else 1  # float16 numbers per entry of an inverse
+        budgets = bool(given.solver.budget or given.solver.step_budget)
+        errors = given.errors or budgets
         self.gpu, self._arrays = gpu, arrays
         self._touched = [given.energies.touch[name] for name in ("force", "spring") if name in given.energies.touch]
         cp, bodies = gpu.cp, len(ranges)
@@ -112,7 +113,7 @@ class GpuEngine(DeviceLoop):
         detection = (
             [x for x in assemble if x.domain not in DOMAINS] if given.contact else []
         )  # reads what the others make
-        search = begins_beside(assemble, ranges, given.errors) if newton else None
+        search = begins_beside(assemble, ranges, errors) if newton else None
         self._whole_assembly = self._beginning([x for x in assemble if x not in detection], detection, settled, search)
         forces = cast(Sequence[DeviceLaunch], stages.first) if stages else ()
         self._first_launches = self._beginning(forces) if alone else self._whole_assembly
@@ -126,9 +127,10 @@ class GpuEngine(DeviceLoop):
         self._prepared = False
         self.solver = PcgSolver(
             gpu, ranges, arrays, self._counter, CAPACITY, planes,
-            phases.of_solves(given.errors) if phases else (), ATTEMPTS if stages else 0,
+            phases.of_solves(errors) if phases else (), ATTEMPTS if stages else 0,
             given.contact is not None,
-            given.contact is not None and bool(given.contact.surfaces or given.contact.ties), correction, given.errors,
+            given.contact is not None and bool(given.contact.surfaces or given.contact.ties), correction, errors,
+            budgets,
         )  # fmt: skip
         self._newton, newton_results = None, None
         if newton and phases:
@@ -223,6 +225,7 @@ class GpuEngine(DeviceLoop):
             "clock": self.gpu.twin(self._arrays["clock"]), "step": self._counter,
             "pool_counters": self.solver.pool_counter, "finished_blocks": self._finished_blocks,
             "results": self.solver.results, "moving": self.gpu.twin(self._arrays["moving"]),
+            "begun": self.solver.begun,
         }  # fmt: skip
         for name, array in arrays.items():
             params[name] = array.data.ptr

@@ -9,6 +9,10 @@
 // displacement that is left: where that is within the bound, or no more linearizations are allowed, it ends the search (bounded_search.cuh).
 #include "newton_begin.cuh"
 #include "bounded_search.cuh"
+#ifdef BUDGETS
+#include "clock.cuh"
+#include "step_budget.cuh"
+#endif
 
 constexpr int LANES = 8, ALL_LANES = BLOCK_NODES * LANES;  // threads of a node in update_state
 
@@ -33,7 +37,7 @@ __device__ __forceinline__ PcgResult& result_of(const NewtonArguments& p, int bo
 __device__ __forceinline__ void decided(const NewtonArguments& p, int body) {
     const int phase = p.search[body].phase;
 #ifdef ERRORS
-    p.phase[body] = phase == LAST ? SOLVE : phase;
+    p.phase[body] = is_awaited(phase) ? SOLVE : phase;
 #else
     p.phase[body] = phase;
 #endif
@@ -143,7 +147,7 @@ extern "C" __global__ void __launch_bounds__(ALL_LANES) update_state(const Newto
         return;
     }
 #ifdef ERRORS
-    if (is_over(search, r)) return end_search(p, here, i, mine);
+    if (is_over(search, r, p.bodies[here.body].position > 0)) return end_search(p, here, i, mine);
 #endif
     const bool lost = status == NOT_FINITE, first = linearizations == 0;
     double sum[2] = {0, 0};
@@ -202,10 +206,23 @@ extern "C" __global__ void __launch_bounds__(BLOCK_NODES) accept_trial(const New
     if (i < here.last)
         for (int c = 0; c < 3; ++c) p.y[3 * i + c] = 0;  // the last solution is no initial guess for a correction
     if (!sum_body(p, here, blockIdx.x, sum)) return;
-    evaluate_trial(search, {p.linearizations, p.trials, p.tolerance}, sqrt(sum[0]), sum[1]);
+    Limits most = {p.linearizations, p.trials, p.tolerance};
+#ifdef BUDGETS
+    const PcgBody& settings = p.bodies[here.body];
+    if (settings.most_linearizations > 0) most.linearizations = settings.most_linearizations;
+    if (search.status == BUDGET) most.linearizations = search.linearizations;
+#endif
+    evaluate_trial(search, most, sqrt(sum[0]), sum[1]);
 #ifdef ERRORS
-    if (search.verdict == TAKEN) search.step_error = search.solve_error;
-    if (search.verdict == TAKEN && search.phase == DONE) search.phase = LAST;
+    const bool bounded = p.bodies[here.body].position > 0;
+    if (search.verdict == TAKEN && bounded) search.step_error = search.solve_error;
+    if (search.verdict == TAKEN && search.phase == DONE && (bounded || search.status == BUDGET)) search.phase = LAST;
+#endif
+#ifdef BUDGETS
+    TrialClock& clock = p.clocks[here.body];
+    clock.decided = nanoseconds();
+    clock.forces = 1e-9 * (clock.decided - clock.solved);
+    end_by_budget(search, settings, clock, *p.begun, clock.decided);
 #endif
     decided(p, here.body);
 }

@@ -167,8 +167,8 @@ class NewtonIteration:
             "ranges": cp.asarray(spans.view(np.int32)),
             "diagonal": cp.asarray(own_blocks(arrays["row_start"], arrays["columns"])),
             "partial_sums": cp.zeros(2 * len(spans)), "finished_blocks": cp.zeros(bodies, np.uint32),
-            "search": phases.search, "phase": phases.phase, "active": phases.active,
-            "step": solver.counter, "pool_counter": solver.pool_counter,
+            "search": phases.search, "phase": phases.phase, "active": phases.active, "begun": solver.begun,
+            "clocks": solver.clocks, "step": solver.counter, "pool_counter": solver.pool_counter,
             "results": solver.results,
             "initial_state": cp.zeros(12 * nodes, real), "increment": cp.zeros(3 * nodes),
             "direction": cp.zeros(3 * nodes),
@@ -184,7 +184,8 @@ class NewtonIteration:
         self._params["capacity"] = results.nbytes // NEWTON_RESULT.itemsize // bodies
         self._later_params = self._params.copy()
         self._later_params["values"] = self._values.data.ptr
-        flags = (*options(gpu.types), *own_headers(), *(["-DERRORS"] if solver.errors else []))
+        kinds = {"ERRORS": solver.errors, "BUDGETS": solver.budgets}
+        flags = (*options(gpu.types), *own_headers(), *(f"-D{kind}" for kind, wanted in kinds.items() if wanted))
         module = gpu.cp.RawModule(code=NEWTON.checked(), options=flags, backend="nvrtc")
         self._begin, self._update_state, self._accept_trial, self._end = (
             compiled("newton.cu", module, name)

@@ -66,7 +66,7 @@ __device__ __forceinline__ void begin_range(const NewtonArguments& p, int range)
     if (!sum_body(p, here, range, sum)) return;
     start_search(p.search[here.body], sqrt(sum[0]), EPSILON<local> * sqrt(sum[1]), p.bodies[here.body].kind);
 #ifdef ERRORS
-    p.search[here.body].forcing = MOST_FORCING;
+    if (p.bodies[here.body].position > 0) p.search[here.body].forcing = MOST_FORCING;
 #endif
     p.phase[here.body] = SOLVE;
 }

@@ -27,6 +27,8 @@ struct NewtonArguments {
     PcgResult* results;            // (capacity, bodies) of the last solve; at the end of the step
     NewtonResult* newton_results;  // (capacity, bodies) on the host
     const long long* step;         // (1,) completed
+    const long long* begun;        // (1,) time at which the step began [ns]
+    TrialClock* clocks;            // (bodies,)
     unsigned* pool_counter;        // (1,) of the solver; set to zero before each of its launches
     const int* row_start;
     const int* columns;
