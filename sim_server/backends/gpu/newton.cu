@@ -14,19 +14,22 @@
 #include "step_budget.cuh"
 #endif
 
-constexpr int LANES = 8, ALL_LANES = BLOCK_NODES * LANES;  // threads of a node in update_state
+// Of update_state, whose thread blocks have parts of ranges, so that small bodies, too, use many multiprocessors.
+constexpr int LANES = 8;                                        // threads of a node
+constexpr int PART_NODES = BLOCK_NODES / PARTS, ALL_LANES = PART_NODES * LANES;
 
 // Sums over a body by thread blocks of update_state; true in the one thread that has the result, in the one that finishes last.
 __device__ __forceinline__ bool sum_lanes(const NewtonArguments& p, const NodeRange& here, double (&sum)[2]) {
-    __shared__ double warps[LANES][2];
+    constexpr int ALL_WARPS = ALL_LANES / 32;
+    __shared__ double warps[ALL_WARPS][2];
     add_over_warp(sum);
     if (threadIdx.x % 32 == 0)
         for (int n = 0; n < 2; ++n) warps[threadIdx.x / 32][n] = sum[n];
     __syncthreads();  // all writes of this thread block are done
     if (threadIdx.x >= 32) return false;
     const int lane = threadIdx.x;
-    for (int n = 0; n < 2; ++n) sum[n] = lane < LANES ? warps[lane][n] : 0;
-    return sum_body(p, here, blockIdx.x, sum);
+    for (int n = 0; n < 2; ++n) sum[n] = lane < ALL_WARPS ? warps[lane][n] : 0;
+    return sum_body(p, here, blockIdx.x, sum, PARTS);
 }
 
 __device__ __forceinline__ PcgResult& result_of(const NewtonArguments& p, int body) {
@@ -128,10 +131,10 @@ __device__ __forceinline__ void multiply_row(const NewtonArguments& p, int begin
 // Sets the state of the next trial: along a new direction after a solve, else with a shorter step along the present one.
 // Reads that do not depend on each other stand together, since their latencies are most of its time.
 extern "C" __global__ void __launch_bounds__(ALL_LANES) update_state(const NewtonArguments p) {
-    const NodeRange here = p.ranges[blockIdx.x];
+    const NodeRange here = p.ranges[blockIdx.x / PARTS];
     const PcgResult& r = result_of(p, here.body);
     Search& search = p.search[here.body];
-    const int i = here.first + threadIdx.x / LANES, lane = threadIdx.x % LANES;
+    const int i = here.first + blockIdx.x % PARTS * PART_NODES + threadIdx.x / LANES, lane = threadIdx.x % LANES;
     const bool inside = i < here.last, mine = inside && lane == 0;
     const int begin = inside ? p.row_start[i] : 0, end = inside ? p.row_start[i + 1] : 0;
     const int phase = search.phase, linearizations = search.linearizations, status = r.status;

@@ -26,7 +26,8 @@ from sim_server.backends.newton import Newton
 
 NEWTON = Declarations("backends/gpu/newton.cu")
 BLOCK_NODES: int = NEWTON.constant("BLOCK_NODES")  # of a thread block
-LANES: int = NEWTON.constant("LANES")  # threads of a node in the kernel `update_state`
+PARTS: int = NEWTON.constant("PARTS")  # of such nodes, each of a thread block of the kernel `update_state`
+LANES: int = NEWTON.constant("LANES")  # threads of a node there
 NODE_RANGE = NEWTON.dtype("NodeRange")
 SEARCH = NEWTON.dtype("Search")
 NEWTON_ARGUMENTS = NEWTON.dtype("NewtonArguments")
@@ -166,7 +167,7 @@ class NewtonIteration:
         self._memory = twins | {
             "ranges": cp.asarray(spans.view(np.int32)),
             "diagonal": cp.asarray(own_blocks(arrays["row_start"], arrays["columns"])),
-            "partial_sums": cp.zeros(2 * len(spans)), "finished_blocks": cp.zeros(bodies, np.uint32),
+            "partial_sums": cp.zeros(2 * PARTS * len(spans)), "finished_blocks": cp.zeros(bodies, np.uint32),
             "search": phases.search, "phase": phases.phase, "active": phases.active, "begun": solver.begun,
             "clocks": solver.clocks, "step": solver.counter, "pool_counter": solver.pool_counter,
             "results": solver.results,
@@ -234,10 +235,10 @@ class NewtonIteration:
     def _trial(self, params: NDArray[Any], values: DeviceArray | None) -> None:
         """Launches a solve, the state that it gives, the forces there and the decision. values: A; None: the first."""
         self._solver.launch(values)
-        self._launch(self._update_state, BLOCK_NODES * LANES, params)
+        self._launch(self._update_state, BLOCK_NODES // PARTS * LANES, params, PARTS)
         for launch in self._forces:
             launch()
         self._launch(self._accept_trial, BLOCK_NODES, params)
 
-    def _launch(self, function: KernelFunction, threads: int, params: NDArray[Any]) -> None:
-        function((self._grid,), (threads,), (params,))
+    def _launch(self, function: KernelFunction, threads: int, params: NDArray[Any], parts: int = 1) -> None:
+        function((self._grid * parts,), (threads,), (params,))

@@ -12,13 +12,14 @@
 #endif
 
 constexpr int BLOCK_NODES = 32;  // of a range
+constexpr int PARTS = 4;         // of a range, where each has a thread block of its own
 #define WHOLE_WARP 0xffffffffu
 
 struct NodeRange { int body, first, last, first_range, ranges, unused[3]; };  // nodes [first, last) of the scene; ranges of the body
 
 struct NewtonArguments {
     const NodeRange* ranges;       // (grid,) by body
-    double* partial_sums;          // (grid, 2) sums of the ranges
+    double* partial_sums;          // (grid, PARTS, 2) sums of the ranges, or of their parts
     unsigned* finished_blocks;     // (bodies,) zero between launches
     Search* search;                // (bodies,)
     int* phase;                    // (bodies,) of each body's search, read by the other launches
@@ -57,20 +58,21 @@ __device__ __forceinline__ void add_over_warp(double (&sum)[2]) {
         for (int n = 0; n < 2; ++n) sum[n] += __shfl_xor_sync(WHOLE_WARP, sum[n], k);
 }
 
-// Sums over a body, of which this warp has range `mine`, here; true in the one lane that has the result, in the warp that finishes last.
-__device__ __forceinline__ bool sum_body(const NewtonArguments& p, const NodeRange& here, int mine, double (&sum)[2]) {
+// Sums over a body, of which this warp has part `mine` of all ranges' `parts` parts; true in the one lane that has the result, in the warp
+// that finishes last.
+__device__ __forceinline__ bool sum_body(const NewtonArguments& p, const NodeRange& here, int mine, double (&sum)[2], int parts = 1) {
     const int lane = threadIdx.x % 32;
     add_over_warp(sum);
     int last = 0;
     if (lane == 0) {
         for (int n = 0; n < 2; ++n) __stcg(p.partial_sums + 2 * mine + n, sum[n]);
         __threadfence();
-        last = atomicAdd(p.finished_blocks + here.body, 1u) == (unsigned)here.ranges - 1;
+        last = atomicAdd(p.finished_blocks + here.body, 1u) == (unsigned)(parts * here.ranges) - 1;
     }
     if (!__shfl_sync(WHOLE_WARP, last, 0)) return false;
     __threadfence();
     sum[0] = sum[1] = 0;
-    for (int k = here.first_range + lane; k < here.first_range + here.ranges; k += 32)
+    for (int k = parts * here.first_range + lane, end = parts * (here.first_range + here.ranges); k < end; k += 32)
         for (int n = 0; n < 2; ++n) sum[n] += __ldcg(p.partial_sums + 2 * k + n);
     add_over_warp(sum);
     if (lane == 0) p.finished_blocks[here.body] = 0;

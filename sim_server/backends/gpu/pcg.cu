@@ -60,6 +60,7 @@ struct BlockMemory {  // static shared memory of a thread block: data that is th
 #endif
 #ifdef BUDGETS
     long long began, deadline;     // of the solve [ns]
+    long long looked;              // at the clock, by the first thread of the first thread block
 #endif
 };
 __shared__ BlockMemory memory;
@@ -407,7 +408,7 @@ struct PcgSolver {
         }
         for (int k = 16; k; k >>= 1) mine[0] += __shfl_xor_sync(ALL, mine[0], k);
 #ifdef BUDGETS
-        mine[1] = group.index == 0 && threadIdx.x == 0 && is_spent(memory.body, memory.began, memory.deadline, nanoseconds());
+        mine[1] = group.index == 0 && threadIdx.x == 0 && looks_at_clock();
         sums_and_change<2, 1>(mine, zr, largest2([&](int k) { return rows.x[k] - rows.before[k]; }));
         spent = zr[1] > 0;
 #elif defined(ERRORS)
@@ -417,6 +418,14 @@ struct PcgSolver {
 #endif
         return zr[0];
     }
+
+#ifdef BUDGETS
+    static __device__ __forceinline__ bool looks_at_clock() {
+        const long long now = nanoseconds(), iteration = now - memory.looked;
+        memory.looked = now;
+        return is_spent(memory.body, memory.began, memory.deadline, now, iteration);
+    }
+#endif
 
     __device__ __forceinline__ double by_diagonal(int kind) const {
         const BlockRows rows = memory.rows;
@@ -907,7 +916,7 @@ __device__ __forceinline__ void solve_body(const PcgArguments& s, const RowRange
         reserve = seconds_after_solve(clock);
         if (later && range.index == 0) clock.blocks = 1e-9 * (begin - clock.decided);
 #endif
-        memory.began = begin;
+        memory.began = memory.looked = begin;
         memory.deadline = deadline_of(memory.body, __ldcg(s.begun), reserve);
     }
 #endif

@@ -10,9 +10,11 @@ HOST_DEVICE long long deadline_of(const PcgBody& body, long long begun, double r
     return body.step_budget > 0 ? begun + (long long)(1e9 * (body.step_budget - reserve)) : 0;
 }
 
-// Whether a solve that began at `start` has spent its time. All in ns.
-HOST_DEVICE bool is_spent(const PcgBody& body, long long start, long long deadline, long long now) {
-    return (deadline != 0 && now > deadline) || (body.budget > 0 && 1e-9 * (now - start) > body.budget);
+// Whether a solve that began at `start` has spent its time, where another iteration and what ends the solve, its true residual, take
+// as long as an iteration each. iteration: of the last one. All in ns.
+HOST_DEVICE bool is_spent(const PcgBody& body, long long start, long long deadline, long long now, long long iteration) {
+    const long long end = now + 2 * iteration;
+    return (deadline != 0 && end > deadline) || (body.budget > 0 && 1e-9 * (end - start) > body.budget);
 }
 
 // Whether a solve ends after so many iterations. In a replay the budget is -1 - those of the step.
@@ -28,9 +30,10 @@ HOST_DEVICE double budget_left(double budget, int iterations) {
 // From a solve to the end of the step: forces of its trial, and blocks and a product for its estimate [s].
 HOST_DEVICE double seconds_after_solve(const TrialClock& c) { return c.forces + c.blocks + c.judging; }
 
-// Of another linearization, to its estimate [s].
+// Of another linearization, to its estimate [s]: of a solve that is as long as those before, or has three iterations.
 HOST_DEVICE double seconds_of_another(const Search& s, const TrialClock& c) {
-    return c.blocks + 3 * s.seconds / (s.iterations > 1 ? s.iterations : 1) + seconds_after_solve(c);
+    const double usual = s.seconds / s.linearizations, few = 3 * s.seconds / (s.iterations > 1 ? s.iterations : 1);
+    return c.blocks + (usual < few ? usual : few) + seconds_after_solve(c);
 }
 
 // After a trial was evaluated: where the budget does not allow another linearization, or did not in the run that is replayed, the state
