@@ -33,6 +33,7 @@ SCENES = {
     "beam.toml, float32": ("solver.precision=float32",),
     "beam.toml, Newton": ("integrator.linearizations=3", "integrator.scheme=newmark"),
     "beam.toml, accuracy": ("accuracy.position='1 %'", "solver.precision=mixed"),
+    "graft.toml, accuracy": ("accuracy.position=1e-4", "solver.precision=mixed"),
     "beam.toml, budget of a search": ("solver.budget_ms=2", "integrator.linearizations=3", "solver.precision=mixed"),
     "four_beams.toml, budget of solves": ("solver.budget=1e-3",),
     "floor_drop.toml, accuracy": ("accuracy.position=1e-4",),
