@@ -33,7 +33,7 @@ constexpr double MOST_FORCING = 0.1, FORCING_FACTOR = 0.9;    // largest forcing
 constexpr double MOST_FORCING_WITHOUT_FACTOR = MOST_LEFT_WITHOUT_FACTOR;
 template <class T> constexpr double EPSILON = sizeof(T) == 8 ? 2.2e-16 : 1.2e-7;  // T: type in which forces are computed
 
-enum Phase { SOLVE = 0, TRY = 1, DONE = 2, LAST = 3 };  // LAST, on a GPU: over, but its error is to be estimated
+enum Phase { SOLVE = 0, TRY = 1, DONE = 2, LAST = 3, SPENT = 4 };  // on a GPU LAST: over, but its error is to be estimated; SPENT: likewise, by a budget
 enum Verdict { NONE_YET = 0, SHORTER = 1, TAKEN = 2, LOST = 3 };  // on a trial. LOST: no trial along the direction has a finite residual
 
 struct Search {                        // Newton iteration of a step, of one body

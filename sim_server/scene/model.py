@@ -364,6 +364,19 @@ class Scene(Parameters):
         check_holders_on(device, self.holders or [], self.integrator)
         if "contact" in self.effects:
             check_contact_on(device, self.effects["contact"], self.integrator)
+        if device == "gpu":
+            self._check_budgets_on_gpu()
+
+    def _check_budgets_on_gpu(self) -> None:
+        """Raises InputError for a budget of wall time of solves that a GPU does not end by one."""
+        between = [word for word in ("attachments", "springs") if getattr(self, word)]
+        between += ["contact"] if "contact" in self.effects else []
+        for name in ("budget", "budget_ms"):
+            if between and (given := getattr(self.solver, name)):
+                raise InputError(
+                    f"solver.{name} = {given:g} with {between[0]} on a GPU, which ends no solve of several passes or "
+                    "bodies by wall time; allowed: none, and max_iterations bounds a solve"
+                )
 
     @property
     def projection(self) -> Literal["excess", "clamp", "absolute", "none"]:

@@ -192,12 +192,3 @@ class SolverOptions(Parameters):
             raise InputError(
                 f'solver.extrapolate = {self.extrapolate:g}: must be 0 without build = "worker", and on a GPU'
             )
-        if device == "gpu" and self.budget_ms is not None:
-            raise InputError(
-                f"solver.budget_ms = {self.budget_ms:g} on a GPU, where only steps on a CPU are ended early; allowed: "
-                "none, and max_iterations bounds a solve"
-            )
-        if device == "gpu" and self.budget:
-            raise InputError(
-                f"solver.budget = {self.budget:g}: must be 0 on a GPU, which bounds a solve by max_iterations"
-            )

@@ -21,12 +21,12 @@ from sim_server.backends.gpu import newton as gpu_newton
 from sim_server.backends.gpu.kernel_fusion import DOMAINS
 from sim_server.backends.gpu.newton import NewtonIteration, NewtonPhases
 from sim_server.backends.gpu.solver import PCG_BODY
-from sim_server.backends.gpu.structs import NEWTON_RESULT, PCG_RESULT
+from sim_server.backends.gpu.structs import NEWTON_RESULT, PCG, PCG_RESULT
 from sim_server.backends.newton import Newton
 from sim_server.simulation import Simulation
 from tests.backends.fake_cupy import Array
 from tests.backends.fake_graphs import Graphs
-from tests.backends.pcg_on_threads import Solver, SolverHost
+from tests.backends.pcg_on_threads import CLOCK, Solver, SolverHost
 
 TESTS = Path(__file__).parent.parent
 SOLVE = 0  # phase
@@ -59,7 +59,8 @@ extern "C" void solve(const PcgArguments* s, const int* active, const int* phase
 def compiled(folder: Path, *defined: str) -> c.CDLL:
     """Compiles newton.cu."""
     (folder / "newton.cpp").write_text(TEXT)
-    paths = [f"-I{p}" for p in (TESTS / "backends", SOURCES / "backends/gpu", INCLUDE)]
+    (folder / "clock.cuh").write_text(CLOCK)
+    paths = [f"-I{p}" for p in (folder, TESTS / "backends", SOURCES / "backends/gpu", INCLUDE)]
     command = [compiler(), "-std=c++20", "-O1", "-shared", "-fPIC", "-Dreal=double", "-w", *paths]
     command += [f"-D{word}" for word in defined]
     subprocess.run([*command, str(folder / "newton.cpp"), "-o", str(folder / "newton.so")], check=True)
@@ -138,7 +139,8 @@ class OnThreads:
         self.told = np.zeros((len(self.results), bodies), NEWTON_RESULT)
         self._solver: Any = SimpleNamespace(
             counter=counter, pool_counter=pool_counter, results=as_device(self.results), bodies_device=rows,
-            launch=self._solve, errors=solves is not None,
+            launch=self._solve, errors=solves is not None, budgets=bool(sim.scene.solver.step_budget),
+            begun=zeros(1, np.int64), clocks=as_device(np.zeros(bodies, PCG.dtype("TrialClock"))),
         )  # fmt: skip
         arrays = {"row_start": s.row_start, "columns": s.columns, "values": s.values, "b": s.b_material, "y": s.y}
         arrays |= {"x": w.x, "v": w.v}

@@ -113,6 +113,10 @@ static unsigned atomicAdd(unsigned* a, int by) { return __atomic_fetch_add(a, by
 static void __trap() { std::abort(); }
 static int max(int a, int b) { return a < b ? b : a; }
 """
+CLOCK = """
+#pragma once
+static long long nanoseconds() { static long long now; return now += 1000; }
+"""
 WORDS = [
     (r'asm volatile\("st\.relaxed\.gpu\.global\.u64[^\n]*\n', "bits = w;\n"),
     (r'asm volatile\("ld\.relaxed\.gpu\.global\.u64[^\n]*\n', "w = *this;\n"),
@@ -139,8 +143,7 @@ def compiled(folder: Path, text: str, *defined: str) -> c.CDLL:
     approximate = r"    double y;\n    asm\(.*?\n    return y \* \(2 - a \* y\);"
     solver, found = re.subn(approximate, "    return 1 / a;", solver, flags=re.DOTALL)
     assert found == 1
-    clock = "#pragma once\nstatic long long nanoseconds() { return 0; }\n"
-    headers = {"block_group.cuh": group, "pcg.cu": solver, "partitioned_inverse.cuh": INVERSE, "clock.cuh": clock}
+    headers = {"block_group.cuh": group, "pcg.cu": solver, "partitioned_inverse.cuh": INVERSE, "clock.cuh": CLOCK}
     for name, written in headers.items():
         (folder / name).write_text(written)
     for name in ("spmv.cuh", "correction.cuh", "contact.cu"):  # beside the other headers
@@ -190,14 +193,15 @@ class Solver:
         if sim.touch:
             own = {"spring": gpu.twin(sim.touch.spring), "coefficients": as_device(sim.world.coefficients)}
             touch = SimpleNamespace(arrays=own)
+        own = sim.scene.solver
+        budgets = bool(own.budget or own.step_budget)
         sites = int(given.contact.body_start[-1]) // 2 if given.contact else 0
         self.correction = FactorCorrection(gpu, sim.scene.solver.woodbury, list(given.ranges), touch, sites)
         self.counter, contact = as_device(np.zeros(1, np.int64)), given.contact is not None
         self.solver = PcgSolver(
             gpu, given.ranges, given.arrays, self.counter, 4, contact=contact, correction=self.correction,
-            errors=given.errors, phases=phases,
+            errors=given.errors or budgets, phases=phases, budgets=budgets,
         )  # fmt: skip
-        own = sim.scene.solver
         rows = self.solver.bodies
         assert rows["blocks"].sum() == blocks
         rows["tolerance"], rows["max_iterations"], rows["warm_start"] = (
@@ -207,7 +211,7 @@ class Solver:
         )
         for body, row in zip(sim.world.bodies, rows, strict=True):
             settings = sim.engine.settings(body.index)
-            for name in ("position", "trust", "dx_dv"):
+            for name in ("position", "trust", "dx_dv", "budget", "step_budget"):
                 row[name] = getattr(settings, name)
         rows["kind"] = KINDS.enumeration("Kind")["BLOCK_JACOBI" if own.preconditioner == "block_jacobi" else "CHOLESKY"]
         rows["factor_step"] = -1

@@ -90,9 +90,9 @@ def test_a_loop_makes_the_launches_of_the_unrolled_form_that_do_anything(cupy, m
         looped, unrolled = (made(cupy, sim) for sim in sims)
         names = [name(launch) for launch in looped]
         later = ["blocks", *TRIAL]
-        assert names == ["begin_newton", *TRIAL, *later * (needed - 1), "end_newton", "end"], names
+        assert names == [*TRIAL, *later * (needed - 1), "end_newton", "end"], names
         others = [name(launch) for launch in unrolled]
-        assert others == ["begin_newton", *TRIAL, *later * 8, "end_newton", "end"]
+        assert others == [*TRIAL, *later * 8, "end_newton", "end"]
         last = [k for k, found in enumerate(others) if found == "accept_trial"][needed - 1]
         effective = unrolled[: last + 1] + unrolled[others.index("end_newton") :]
         assert comparable(effective) == comparable(looped)
@@ -116,6 +116,17 @@ def test_later_linearizations_have_a_matrix_of_their_own(cupy, monkeypatch):
             assert later in addresses and first not in addresses
             needed = "== 0))" if name(launch) == "blocks" else "!= 2))"  # solved next; not done
             assert f"phase[body[block * BLOCK_ITEMS + threadIdx.x]] {needed} return;" in launch[1]
+
+
+def test_the_search_begins_beside_the_first_blocks(cupy, monkeypatch):
+    sim = simulation(monkeypatch, True, linearizations=3, scheme="bdf2")
+    sim.engine.assemble()
+    begins = [(name(x), x) for x in cupy.ran if x[0] == "fused" and "begin_beside(prologue" in x[1]]
+    assert [domain for domain, _ in begins] == ["blocks"]
+    cupy.ran.clear()
+    sim.engine.solve()
+    ends = [x for x in cupy.ran if x[0] == "end_newton"]
+    assert begins[0][1][4][-1].tobytes() == ends[0][4][0].tobytes()  # with the same arguments
 
 
 def test_one_linearization_has_the_launches_of_a_solve_alone(cupy, monkeypatch):

@@ -154,9 +154,9 @@ def test_the_search_compiles_and_spills_no_registers(precision, arch):
 
 
 def test_the_nodes_of_a_body_are_shared_out_in_stretches():
-    found, start = node_ranges(np.array([[0, 1], [1, 1 + 2 * BLOCK_NODES], [1 + 2 * BLOCK_NODES, 5 + 3 * BLOCK_NODES]]))
-    assert start.tolist() == [0, 1, 3, 5]
+    found = node_ranges(np.array([[0, 1], [1, 1 + 2 * BLOCK_NODES], [1 + 2 * BLOCK_NODES, 5 + 3 * BLOCK_NODES]]))
     assert found["body"].tolist() == [0, 1, 1, 2, 2]
+    assert found["first_range"].tolist() == [0, 1, 1, 3, 3] and found["ranges"].tolist() == [1, 2, 2, 2, 2]
     nodes = [n for row in found for n in range(row["first"], row["last"])]
     assert nodes == list(range(5 + 3 * BLOCK_NODES)) and (found["last"] - found["first"]).max() == BLOCK_NODES
 

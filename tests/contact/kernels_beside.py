@@ -148,7 +148,7 @@ def compiled(folder: Path, text: str, *options: str) -> c.CDLL:
             header, found = re.subn(rf"{number} = \d+", f"{number} = {THREADS}", header)
             assert found == 1
         (folder / name).write_text(header)
-    for name in ("contact.cu", "faces.cu", "face_sweep.cuh", "pairs.cu", "island.cu", "ties.cu"):
+    for name in ("contact.cu", "faces.cu", "face_sweep.cuh", "pairs.cu", "island.cu", "island_error.cuh", "ties.cu"):
         (folder / name).write_text((SOURCES / "backends/gpu" / name).read_text())
     (folder / "kernels.cpp").write_text(text)
     paths = [f"-I{p}" for p in (folder, TESTS / "backends", SOURCES / "backends/gpu", INCLUDE)]
@@ -217,8 +217,8 @@ class Beside:
         self.balance = as_device(np.zeros(bodies, BALANCE))
         self.bodies = np.zeros(bodies, PCG_BODY)
         solver: Any = SimpleNamespace(
-            errors=False,
-            real=np.dtype(float), pool_counter=as_device(np.zeros(1, np.uint32)), results=self.results,
+            errors=sim.scene.accuracy is not None, real=np.dtype(float),
+            pool_counter=as_device(np.zeros(1, np.uint32)), results=self.results,
             counter=self.counter, bodies_device=self.bodies.ctypes.data,
         )  # fmt: skip
         self.broken = np.zeros(len(self.contact.ties.broken) if self.contact.ties else 0, np.int32)
@@ -233,6 +233,9 @@ class Beside:
         self.bodies["first"], self.bodies["nodes"] = self.ranges[:, 0], np.diff(self.ranges)[:, 0]
         own = sim.scene.solver
         self.bodies["tolerance"], self.bodies["max_iterations"] = own.tolerance, own.max_iterations
+        for body, row in zip(sim.world.bodies, self.bodies, strict=True):
+            settings = sim.engine.settings(body.index)
+            row["position"], row["trust"], row["dx_dv"] = settings.position, settings.trust, settings.dx_dv
         self.bodies["warm_start"], self.bodies["kind"] = own.warm_start, KINDS.enumeration("Kind")["BLOCK_JACOBI"]
 
     def step(self) -> tuple[np.ndarray, np.ndarray]:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from sim_server.scene import Scene
 from sim_server.simulation import Simulation
 from sim_server.updates.driver import Driver
-from tests.contact.scenes import over
+from tests.contact.scenes import D, block, over
 from tests.scenes import bar, scene
 
 pytestmark = pytest.mark.gpu
@@ -89,6 +89,18 @@ def test_contact_ends_where_it_does_on_a_cpu():
     made = bounded(over(at=(0, 0.006, 0), solver=SOLVER | {"preconditioner": "block_jacobi"}).scene)
     found = compared(made, 1e-2)
     assert (found["contacts"] > 0).any()
+
+
+@pytest.mark.parametrize("kind", ["block_jacobi", "cholesky"])
+def test_bodies_that_touch_each_other_end_near_where_they_do_on_a_cpu(kind):
+    blocks = [block(cells=(2, 1, 2), size=(0.08, 0.04, 0.08), name=f"b{k}", at=(0, D + 0.042 * k, 0)) for k in (0, 1)]
+    made = over(objects=blocks, solver=SOLVER | {"preconditioner": kind}).scene
+    (gpu, x), (cpu, expected) = (run(bounded(made), device) for device in ("gpu", "cpu"))
+    assert np.abs(x - expected).max() <= 24 * POSITION and (gpu["status"] == cpu["status"]).all()
+    moving = gpu["iterations"] > 0
+    assert moving.any() and (gpu["solve_error"][moving] > 0).all() and np.nanmax(gpu["solve_error"]) <= POSITION
+    exact, _ = run(bounded(made, 1e-13), "gpu")
+    assert gpu["iterations"].sum() < 0.8 * exact["iterations"].sum()
 
 
 def test_a_run_repeats_to_the_bit():

@@ -94,6 +94,15 @@ def test_contradictions_are_refused(scene, given, message):
         scene(*given)
 
 
+@pytest.mark.parametrize(("name", "value"), [("budget", 1e-3), ("budget_ms", 2.0)])
+def test_a_budget_ends_no_solve_of_several_passes_on_a_gpu(scene, name, value):
+    scene(f"solver.{name}={value}").check_device("gpu")
+    touching = scene(f"solver.{name}={value}", "effects.contact.self=true")
+    touching.check_device("cpu")
+    with pytest.raises(InputError, match=rf"solver\.{name} = {value:g} with contact on a GPU"):
+        touching.check_device("gpu")
+
+
 def test_the_loop_has_it_in_metres(scene):
     settings = Simulation(scene("accuracy.position='0.5 %'", "solver.budget_ms=2")).engine.settings(0)
     assert math.isclose(settings.position, 1e-3) and settings.dx_dv == 0.01

@@ -37,12 +37,3 @@ def test_a_simulation_asks():
 )
 def test_values_of_l_travel_as(precision, wire):
     assert SolverOptions(factor_precision=precision).factor_dtype == wire
-
-
-def test_a_budget_of_wall_time_is_for_cpus():
-    solver = SolverOptions(budget=1e-3)
-    solver.check_device("cpu")
-    with pytest.raises(InputError, match=r"solver\.budget = 0\.001: must be 0 on a GPU"):
-        solver.check_device("gpu")
-    with pytest.raises(InputError, match=r"solver\.budget_ms = 2 on a GPU"):
-        SolverOptions(budget_ms=2.0).check_device("gpu")

@@ -10,12 +10,21 @@ HOST_DEVICE double first_tolerance(const Search& s, const PcgBody& body) {
     return s.linearizations == 0 ? solve_tolerance(s, body.tolerance, body.plan ? body.kind : BLOCK_JACOBI) : body.tolerance;
 }
 
+// Whether a search that has ended awaits the estimate of its error.
+HOST_DEVICE bool is_awaited(int phase) { return phase == LAST || phase == SPENT; }
+
 // Judges the last trial by z = P^-1 b of `kind`, |z| = size, in the solve of a later linearization. Returns whether the search ends; else the
 // forcing term is that of the solve.
 HOST_DEVICE bool ends_by_start(Search& s, const PcgBody& settings, int kind, double size) {
     if (kind != s.kind) s.factor_scale = 0;
-    s.applied = kind == CHOLESKY && kind == s.kind;
-    bound_error(s, state_error(s, size, settings.dx_dv), settings.trust, settings.position);
+    const double estimate = state_error(s, size, settings.dx_dv);
+    if (settings.position > 0) {
+        s.applied = kind == CHOLESKY && kind == s.kind;
+        bound_error(s, estimate, settings.trust, settings.position);
+    } else {
+        s.step_error = estimate;
+    }
+    if (s.phase == SPENT) s.status = BUDGET;
     return s.phase != SOLVE;
 }
 
@@ -29,8 +38,8 @@ HOST_DEVICE void note_left(Search& s, double solution, double difference, double
 }
 
 // After a solve: whether the search is over, since its start was exact enough, or nothing was to be estimated.
-HOST_DEVICE bool is_over(const Search& s, const PcgResult& r) {
-    return s.phase == DONE || s.phase == LAST || (s.linearizations > 0 && r.iterations == 0 && r.status == CONVERGED);
+HOST_DEVICE bool is_over(const Search& s, const PcgResult& r, bool bounded) {
+    return s.phase == DONE || is_awaited(s.phase) || (bounded && s.linearizations > 0 && r.iterations == 0 && r.status == CONVERGED);
 }
 
 // A member of a result in which 0 is not known.

@@ -27,11 +27,11 @@ from sim_server.backends.gpu.device import DeviceLaunch, Gpu
 from sim_server.backends.gpu.energies import DeviceEnergies
 from sim_server.backends.gpu.factor_upload import FactorUpload
 from sim_server.backends.gpu.held import HeldForces, leading
-from sim_server.backends.gpu.kernel_fusion import DOMAINS, Epilogue, FusedKernel, fuse
+from sim_server.backends.gpu.kernel_fusion import DOMAINS, Epilogue, FusedKernel, Prologue, fuse
 from sim_server.backends.gpu.loop import CAPACITY, MANY, DeviceLoop
 from sim_server.backends.gpu.mailbox import ChangeMailbox, DeviceMailbox
 from sim_server.backends.gpu.measured import MeasuredReport
-from sim_server.backends.gpu.newton import NewtonIteration, NewtonPhases
+from sim_server.backends.gpu.newton import NewtonIteration, NewtonPhases, begins_beside
 from sim_server.backends.gpu.rosenbrock import ATTEMPTS, RosenbrockStep
 from sim_server.backends.gpu.solver import PCG_BODY, PCG_RESULT, SETTINGS_BYTES, PcgSolver
 from sim_server.backends.gpu.state import device_array, device_arrays
@@ -68,8 +68,7 @@ class DeviceSettings:
         return self._row[name].item()
 
     def __setattr__(self, name: str, value: Any) -> None:
-        unknown = ("budget", "omega", "most_linearizations")  # no budget of a solve and no SSOR on a GPU
-        if name in unknown or self._row[name] == value:
+        if name == "omega" or self._row[name] == value:  # no SSOR on a GPU
             return
         self._row[name] = value
         self._mailbox.post(self._row.tobytes()[:SETTINGS_BYTES])
@@ -99,6 +98,8 @@ class GpuEngine(DeviceLoop):
         stages, precision = given.stages, given.solver.factor_precision
         fine = precision == "float32" or (precision == "auto" and stages is not None and stages.factor_alone)
         planes = 2 if fine else 1  # float16 numbers per entry of an inverse
+        budgets = bool(given.solver.budget or given.solver.step_budget)
+        errors = given.errors or budgets
         self.gpu, self._arrays = gpu, arrays
         self._touched = [given.energies.touch[name] for name in ("force", "spring") if name in given.energies.touch]
         cp, bodies = gpu.cp, len(ranges)
@@ -113,7 +114,8 @@ class GpuEngine(DeviceLoop):
         detection = (
             [x for x in assemble if x.domain not in DOMAINS] if given.contact else []
         )  # reads what the others make
-        self._whole_assembly = self._beginning([x for x in assemble if x not in detection], detection, settled)
+        search = begins_beside(assemble, ranges, errors) if newton else None
+        self._whole_assembly = self._beginning([x for x in assemble if x not in detection], detection, settled, search)
         forces = cast(Sequence[DeviceLaunch], stages.first) if stages else ()
         self._first_launches = self._beginning(forces) if alone else self._whole_assembly
         self._forces = fuse(forces) if alone else ()  # after a whole assembly, whose energy balance is made already
@@ -126,9 +128,10 @@ class GpuEngine(DeviceLoop):
         self._prepared = False
         self.solver = PcgSolver(
             gpu, ranges, arrays, self._counter, CAPACITY, planes,
-            phases.of_solves(given.errors) if phases else (), ATTEMPTS if stages else 0,
+            phases.of_solves(errors) if phases else (), ATTEMPTS if stages else 0,
             given.contact is not None,
-            given.contact is not None and bool(given.contact.surfaces or given.contact.ties), correction, given.errors,
+            given.contact is not None and bool(given.contact.surfaces or given.contact.ties), correction, errors,
+            budgets,
         )  # fmt: skip
         self._newton, newton_results = None, None
         if newton and phases:
@@ -136,7 +139,7 @@ class GpuEngine(DeviceLoop):
             parts = newton.parts[len(self._first) :]
             newton = Newton(newton.options, newton.dx_dv, parts, newton.detect, **newton.arrays)
             self._newton = NewtonIteration(
-                gpu, device, newton, assemble, ranges, arrays, phases, self.solver, newton_results, settled
+                gpu, device, newton, assemble, ranges, arrays, phases, self.solver, newton_results, settled, search
             )  # fmt: skip
         self._contact, contact_results, reactions, told = None, None, None, None
         self._ties = given.contact.ties if given.contact else None
@@ -229,6 +232,7 @@ class GpuEngine(DeviceLoop):
             "clock": self.gpu.twin(self._arrays["clock"]), "step": self._counter,
             "pool_counters": self.solver.pool_counter, "finished_blocks": self._finished_blocks,
             "results": self.solver.results, "moving": self.gpu.twin(self._arrays["moving"]),
+            "begun": self.solver.begun,
         }  # fmt: skip
         for name, array in arrays.items():
             params[name] = array.data.ptr
@@ -344,10 +348,11 @@ class GpuEngine(DeviceLoop):
         self._stamp_begin((1,), (1,), (self._epilogue,))
 
     def _beginning(
-        self, assemble: Sequence[DeviceLaunch], after: Sequence[DeviceLaunch] = (), readers: Sequence[DeviceLaunch] = ()
-    ) -> Sequence[Callable[[], None]]:
+        self, assemble: Sequence[DeviceLaunch], after: Sequence[DeviceLaunch] = (),
+        readers: Sequence[DeviceLaunch] = (), beside: Prologue | None = None,
+    ) -> Sequence[Callable[[], None]]:  # fmt: skip
         """Fuses the assembly with the energy balance of the step before. after: launches that follow, one by one.
-        readers: later ones that read what it makes.
+        readers: later ones that read what it makes. beside: done beside its last kernel.
 
         The balance is the prologue of a kernel over elements, since these write nothing that it reads. If it freezes a
         body meanwhile, the element results of this body do not matter, since its nodes are fixed then. What advances
@@ -355,7 +360,8 @@ class GpuEngine(DeviceLoop):
         """
         domains = {launch.domain for launch in assemble}
         elements = "elements" in domains and domains <= set(DOMAINS) and not (self._first or self._history)
-        launches = fuse(assemble, prologue=self._energies.prologue if elements else None, after=after, readers=readers)
+        balance = self._energies.prologue if elements else None
+        launches = fuse(assemble, prologue=balance, after=after, readers=readers, beside=beside)
         if not elements:
             return [self._energies.launch_balance, *self._history, *self._first, *launches]
         first = launches[0]

@@ -11,10 +11,10 @@
 #include "face_sweep.cuh"
 #endif
 #include "invert3.cuh"
-
 #ifdef ERRORS
-constexpr double WITHOUT_ESTIMATE = 1e-6;  // tolerance where `position` is to end solves: here nothing estimates the error
+#include "island_error.cuh"
 #endif
+
 constexpr int ROW_SUMS = HAS_TIES ? 2 : 1;  // rows whose state is not that of the set, and those that are no ties
 
 enum Evaluation { WARM_START = 0, ZERO_START = 1, LAW_AT_START = 2, LAW = 3 };  // what rows are evaluated for
@@ -262,12 +262,12 @@ extern "C" __global__ void __launch_bounds__(CONTACT_THREADS) island_balance(con
     if (threadIdx.x < CG_SUMS) a.chunk_sums[(long long)CG_SUMS * blockIdx.x + threadIdx.x] = pick(sum, threadIdx.x);
 }
 
-// Sets what a solve begins with. factors: 0: there is none.
-__device__ void choose_factors(const IslandArguments& a, int island, IslandState& s, long long factors) {
+// Sets what a solve begins with. factors: 0: there is none. end2: square of the residual to which it is expected to go.
+__device__ void choose_factors(const IslandArguments& a, int island, IslandState& s, long long factors, double end2) {
     s.choice = {{FACTOR_COST, 1}, 0, factors, 1, 0, 0};
     s.start2 = s.r2;
     s.switched_after = s.fell = 0;
-    if (factors > 0) begin_pass(a.choice[a.island[a.island_start[island]]], s.choice, sqrt(s.goal2 / s.r2));
+    if (factors > 0) begin_pass(a.choice[a.island[a.island_start[island]]], s.choice, sqrt(end2 / s.r2));
     s.factors = !s.choice.first;
 }
 
@@ -305,17 +305,16 @@ extern "C" __global__ void __launch_bounds__(CONTACT_THREADS) island_decide(cons
         s.set = !(size2 <= tolerance2 * given2);
         s.rested = !s.set;
         s.phase = ISLAND_READY;
+#ifdef ERRORS
+        error_of(a, island).told = 0;
+#endif
     }
     if (what == LAW) {
         s.given2 = given2;
         s.residual = given2 > 0 ? sqrt(size2 / given2) : 0;
         s.relist = s.hold = 0;
         const bool by_law = !s.set || changed[0] == 0, well = s.residual <= tolerance_of(a.c.tolerance, s.rested, s.passes, a.passes), was_last = s.last;
-#ifdef ERRORS
-        const double relative = body.position > 0 ? fmax(body.tolerance, WITHOUT_ESTIMATE) : body.tolerance, goal2 = relative * relative * given2;
-#else
         const double goal2 = body.tolerance * body.tolerance * given2;
-#endif
         const bool linear = HAS_TIES && changed[ROW_SUMS - 1] == 0;  // the law is linear where there are ties alone
         s.last = by_law && (linear || size2 <= tolerance2 * given2);
         if (!isfinite(size2)) {
@@ -338,7 +337,12 @@ extern "C" __global__ void __launch_bounds__(CONTACT_THREADS) island_decide(cons
             s.stage = s.coarse ? BEGINS_COARSE : ITERATES;
             s.restart = 1;
             s.own_iterations = s.own_status = s.pending = 0;
-            choose_factors(a, island, s, (long long)changed[ROW_SUMS]);
+#ifdef ERRORS
+            begin_error(a, island, s, size2, s.last);
+            choose_factors(a, island, s, (long long)changed[ROW_SUMS], expected_end2(a, island, s.goal2));
+#else
+            choose_factors(a, island, s, (long long)changed[ROW_SUMS], s.goal2);
+#endif
             a.coarse_well[island] = 1;
             atomicAdd(&a.tally->iterating, 1);
         }
@@ -521,6 +525,10 @@ extern "C" __global__ void __launch_bounds__(CONTACT_THREADS) island_update(cons
     if (island < 0 || i >= here.end) return;
     const IslandState& s = a.state[island];
     if (!solves(s.phase)) return;
+#ifdef ERRORS
+    if (s.pending && error_of(a, island).of.looks)
+        for (long long k = 3ll * i; k < 3ll * i + 3; ++k) a.before[k] = a.x[k];
+#endif
     if (s.pending)
         for (long long k = 3ll * i; k < 3ll * i + 3; ++k) {
             const double p = a.z[k] + s.beta * a.p[k], q = a.az[k] + s.beta * a.q[k];
@@ -629,6 +637,9 @@ __device__ void next_step(const IslandArguments& a, int island) {
     IslandState s = a.state[island];
     double sum[CG_SUMS];
     sum_island(a, island, a.chunk_sums, sum);
+#ifdef ERRORS
+    const Peaks peaks = peaks_of(a, island);
+#endif
     if (threadIdx.x > 0) return;
     const double gamma = sum[0], delta = sum[1], infinite = 1e300;
     const bool begins = s.stage == BEGINS_COARSE;
@@ -648,10 +659,16 @@ __device__ void next_step(const IslandArguments& a, int island) {
         }
         s.restart = 1;
     } else {
+#ifdef ERRORS
+        if (begins) error_of(a, island).of.looks = false;
+        else if (ends_by_estimate(a, island, s, gamma, sum[4], peaks)) stop = CONVERGED;
+#endif
         s.beta = s.restart ? 0 : gamma / s.gamma;
         const double pq = delta + s.beta * (sum[2] + sum[3]) + s.beta * s.beta * s.pq;
         const double qq = sum[7] + 2 * s.beta * sum[8] + s.beta * s.beta * s.qq, rq = sum[5] + s.beta * sum[6];
-        if (!begins && s.own_iterations == body.max_iterations) {
+        if (stop == CONVERGED) {
+            s.r2 = sum[4];  // of x as it is
+        } else if (!begins && s.own_iterations == body.max_iterations) {
             stop = MAX_ITERATIONS;
         } else if (!(pq > 0)) {
             stop = BREAKDOWN_MATRIX;
@@ -665,6 +682,9 @@ __device__ void next_step(const IslandArguments& a, int island) {
             s.pending = 1;
             s.restart = begins;
             if (s.r2 <= s.goal2) stop = CONVERGED;
+#ifdef ERRORS
+            if (!begins) error_of(a, island).of.move(s.alpha, s.r2);
+#endif
             if (s.choice.probe > 0 && s.own_iterations == s.choice.probe && !s.switched_after && !s.fell) {
                 s.switched_after = s.own_iterations;
                 s.residual_then = sqrt(s.r2 / s.start2);
@@ -688,6 +708,9 @@ extern "C" __global__ void __launch_bounds__(CONTACT_THREADS) island_finish(cons
     if (island < 0 || a.state[island].stage == STANDS) return;
     const bool coarse = a.state[island].coarse && a.coarse_well[island];
     double sum[CG_SUMS] = {};
+#ifdef ERRORS
+    double z2 = 0, change2 = 0;
+#endif
     if (i < here.end) {
         double z[3], az[3], r[3], p[3], q[3];
         copy3(a.z, i, z);
@@ -732,7 +755,14 @@ extern "C" __global__ void __launch_bounds__(CONTACT_THREADS) island_finish(cons
         sum[6] = dot3(r, q);
         sum[7] = dot3(az, az);
         sum[8] = dot3(az, q);
+#ifdef ERRORS
+        z2 = dot3(z, z);
+        change2 = change2_at(a, i);
+#endif
     }
+#ifdef ERRORS
+    leave_peaks(a, z2, change2);
+#endif
     sum_block(sum);
     if (threadIdx.x < CG_SUMS) __stcg(a.chunk_sums + (long long)CG_SUMS * blockIdx.x + threadIdx.x, pick(sum, threadIdx.x));
     __shared__ bool last;
@@ -768,6 +798,9 @@ extern "C" __global__ void __launch_bounds__(CONTACT_THREADS) island_residual(co
             sum[2] += x[k] * product[k];
         }
     }
+#ifdef ERRORS
+    leave_peaks(a, 0, i < here.end ? change2_at(a, i) : 0);
+#endif
     sum_block(sum);
     if (threadIdx.x < CG_SUMS) a.chunk_sums[(long long)CG_SUMS * blockIdx.x + threadIdx.x] = pick(sum, threadIdx.x);
 }
@@ -808,6 +841,9 @@ extern "C" __global__ void __launch_bounds__(SEARCH_THREADS) island_search(const
     sum_island<SEARCH_THREADS>(a, island, a.chunk_sums, sum);
     s.pending = 0;
     s.phase = ISLAND_PASSED;
+#ifdef ERRORS
+    if (error_of(a, island).of.enough && sum[0] <= LOST_DIGITS * s.r2) s.goal2 = fmax(s.goal2, sum[0]);  // it is exact enough
+#endif
     if (s.own_status == CONVERGED && sum[0] > s.goal2) {
         if (sum[0] < 0.25 * s.last_true2) {
             s.last_true2 = sum[0];
@@ -831,9 +867,17 @@ extern "C" __global__ void __launch_bounds__(SEARCH_THREADS) island_search(const
             s.status = NOT_FINITE;
         }
     }
+#ifdef ERRORS
+    const Peaks peaks = peaks_of<SEARCH_THREADS>(a, island);
+#endif
     __syncthreads();
     if (threadIdx.x > 0) return;
     a.state[island] = s;
+#ifdef ERRORS
+    IslandError& error = error_of(a, island);
+    error.told = error.of.told(sum[0], peaks.change);
+    error.of.enough = error.of.looks = false;
+#endif
     if (s.phase != ISLAND_PASSED || s.choice.factor_step == 0 || s.own_iterations == 0) return;
     const PassEnd end = {s.own_iterations, s.switched_after, s.fell, sqrt(sum[0] / s.start2), s.residual_then};
     end_pass(a.choice[a.island[a.island_start[island]]], s.choice, end, 0);
@@ -911,6 +955,9 @@ extern "C" __global__ void __launch_bounds__(CONTACT_THREADS) island_settle(cons
             PcgResult& result = a.c.results[(a.c.step[0] % a.c.capacity) * a.bodies_count + k];
             result = {s.solved, s.seconds, has_factor(body) ? body.factor_step : -1, s.iterations, s.status, factor ? CHOLESKY : BLOCK_JACOBI, body.kind,
                       s.fallbacks, -1, body.probe};
+#ifdef ERRORS
+            result.solve_error = error_of(a, island).told;
+#endif
             a.c.state[k].residual = s.residual;
             a.c.state[k].passes = s.passes;
             a.c.state[k].rounds = s.rounds;

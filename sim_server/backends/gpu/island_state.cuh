@@ -47,6 +47,7 @@ constexpr int CG_SUMS = 9;        // of an iteration
 constexpr int BASE_SUMS = 36;     // Z^T A Z of a body
 constexpr int LISTING_THREADS = 256;  // of find_islands, one thread block
 constexpr int SEARCH_THREADS = 512;   // of island_search
+constexpr int ERROR_BYTES = 256;      // of an IslandError (island_error.cuh), and room
 constexpr double FACTOR_COST = 2;     // of an iteration with factors, over that of one with block Jacobi
 
 enum IslandPhase {
@@ -163,6 +164,9 @@ struct IslandArguments {
     const int *bound_tie, *bound_other;     // those ties in order, and the bodies that they bind the node to
     const int* table_start;      // (tables + 1,) first ones in ties.order
     int* broken_on_host;         // (ties,)
+    char* errors;                // (bodies, ERROR_BYTES) of islands; -DERRORS, as the next two
+    double* before;              // (nodes, 3) solution when it was last looked at
+    double* peaks;               // (grid, 2) largest squares of thread blocks: of z, and of the change of x
 };
 
 typedef SurfaceMotion<real, local> Motion;

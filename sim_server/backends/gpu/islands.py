@@ -155,10 +155,14 @@ class IslandPasses:
             "coarse_sums": MODES * len(chunks), "base_sums": BASE_SUMS * len(chunks), "row_sums": 2 * bodies,
             "coarse_a": bodies * MODES * most, "coarse_b": bodies * MODES * most, "coefficient": MODES * bodies,
         }  # fmt: skip
+        if solver.errors:
+            numbers |= {"before": 3 * nodes, "peaks": 2 * len(chunks)}
         structs = {"state": ("IslandState", bodies), "row": ("IslandRow", rows), "choice": ("PassChoice", bodies)}
         self.memory: dict[str, DeviceArray] = {name: cp.zeros(size, ints) for name, size in sizes.items()}
         self.memory |= {name: cp.zeros(size, doubles) for name, size in numbers.items()}
         self.memory |= {name: cp.zeros(SIZES[kind] * count, np.uint8) for name, (kind, count) in structs.items()}
+        if solver.errors:
+            self.memory["errors"] = cp.zeros(ISLAND.constant("ERROR_BYTES") * bodies, np.uint8)
         self.memory |= {
             "tally": self.tally, "unheld": cp.asarray(free), "chunk_first": cp.asarray(first),
             "finished_chunks": cp.zeros(bodies, np.uint32),

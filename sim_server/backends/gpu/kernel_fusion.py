@@ -311,11 +311,13 @@ def fuse(
     prologue: Prologue | None = None,
     after: Sequence[DeviceLaunch] = (),
     readers: Sequence[DeviceLaunch] = (),
+    beside: Prologue | None = None,
 ) -> list[FusedKernel | DeviceLaunch]:
     """Fuses launches into as few kernels as their domains allow.
 
     guard: makes the guard of a kernel from its launches
     prologue: of the first kernel
+    beside: of the last kernel, if it is not the first one too
     after: launches that follow, one by one
     readers: launches elsewhere that read what these write
     """
@@ -324,10 +326,11 @@ def fuse(
     together = [group for d in DOMAINS for group in _by_items([x for x in launches if x.domain == d])]
     together = [group for group in together if group]
     every = [*launches, *after, *readers]
+    prologues = [prologue, *([None] * (len(together) - 2)), beside][: len(together)]
     fused = [
-        FusedKernel(group, None, _private(group, every), guard(group) if guard else None, None if k else prologue)
-        for k, group in enumerate(together)
-    ]  # fmt: skip
+        FusedKernel(group, None, _private(group, every), guard(group) if guard else None, first)
+        for group, first in zip(together, prologues, strict=True)
+    ]
     return [*fused, *after]
 
 

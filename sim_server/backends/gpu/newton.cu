@@ -7,100 +7,29 @@
 //
 // With a bound of the error of positions (ERRORS), a trial that was taken is judged by the next solve, whose first P^-1 b tells the
 // displacement that is left: where that is within the bound, or no more linearizations are allowed, it ends the search (bounded_search.cuh).
-//
-// A thread block has a range of a body's nodes; the last one of a body to finish adds the partial sums in a fixed order and makes
-// the body's decision. Sums and the increment are double for every `real`.
-#include "pcg_structs.cuh"
+#include "newton_begin.cuh"
 #include "bounded_search.cuh"
-
-#ifndef local
-#define local real
+#ifdef BUDGETS
+#include "clock.cuh"
+#include "step_budget.cuh"
 #endif
 
-constexpr int BLOCK_NODES = 32, LANES = 8, ALL_LANES = BLOCK_NODES * LANES;  // nodes of a thread block; threads of a node in update_state
-constexpr int NO_NODE = 0x7fffffff;
-#define WARP 0xffffffffu
+// Of update_state, whose thread blocks have parts of ranges, so that small bodies, too, use many multiprocessors.
+constexpr int LANES = 8;                                        // threads of a node
+constexpr int PART_NODES = BLOCK_NODES / PARTS, ALL_LANES = PART_NODES * LANES;
 
-struct NodeRange { int body, first, last, unused; };  // nodes [first, last) of the scene
-
-struct NewtonArguments {
-    const NodeRange* ranges;       // (grid,) by body
-    const int* first_range;        // (bodies + 1,) of each body
-    double* partial_sums;          // (grid, 2) sums of the ranges
-    unsigned* finished_blocks;     // (bodies,) zero between launches
-    Search* search;                // (bodies,)
-    int* phase;                    // (bodies,) of each body's search, read by the other launches
-    int* active;                   // (1,) bodies whose iteration is not over
-    int* bad_node;                 // (bodies,) first node whose b is not finite
-    const PcgBody* bodies;
-    PcgResult* results;            // (capacity, bodies) of the last solve; at the end of the step
-    NewtonResult* newton_results;  // (capacity, bodies) on the host
-    const long long* step;         // (1,) completed
-    unsigned* pool_counter;        // (1,) of the solver; set to zero before each of its launches
-    const int* row_start;
-    const int* columns;
-    const real* values;            // (blocks, 3, 3)
-    const real* b;                 // (nodes, 3) material frame
-    real* y;                       // (nodes, 3) material frame: the solution; zero before the solves of corrections; for `advance`
-    const local* rotation;         // (nodes, 3, 3)
-    const real* mass;              // (nodes,) in A [kg]
-    const real* beta;              // (nodes,) [s]
-    real* x;                       // (nodes, 3) [m]
-    real* v;                       // (nodes, 3) [m/s]
-    real* predictor;               // likewise
-    real* damping_velocity;
-    real* inertial_increment;
-    real* initial_state;           // (4, nodes, 3) x, v, predictor, inertial_increment before the step
-    double* increment;             // (nodes, 3) [m/s]
-    double* direction;             // (nodes, 3) [m/s]
-    double dx_dv;                  // [s]
-    double tolerance;
-    int linearizations, trials, nodes, count, capacity;
-};
-
-__device__ __forceinline__ void add_up(double (&sum)[2]) {
-    for (int k = 16; k; k >>= 1)
-        for (int n = 0; n < 2; ++n) sum[n] += __shfl_xor_sync(WARP, sum[n], k);
-}
-
-// Sums over a thread block, in thread 0.
-template <int THREADS>
-__device__ __forceinline__ void sum_block(double (&sum)[2]) {
-    add_up(sum);
-    if constexpr (THREADS > 32) {
-        __shared__ double warps[THREADS / 32][2];
-        __syncthreads();  // earlier contents have been read
-        if (threadIdx.x % 32 == 0)
-            for (int n = 0; n < 2; ++n) warps[threadIdx.x / 32][n] = sum[n];
-        __syncthreads();
-        for (int n = 0; n < 2; ++n) {
-            sum[n] = 0;
-            for (int k = 0; k < THREADS / 32; ++k) sum[n] += warps[k][n];
-        }
-    }
-}
-
-// Sums over a body; true in the one thread that has the result, in the thread block that finishes last.
-template <int THREADS>
-__device__ __forceinline__ bool sum_body(const NewtonArguments& p, int body, double (&sum)[2]) {
-    __shared__ bool last;
-    const int first = p.first_range[body], end = p.first_range[body + 1];
-    sum_block<THREADS>(sum);
+// Sums over a body by thread blocks of update_state; true in the one thread that has the result, in the one that finishes last.
+__device__ __forceinline__ bool sum_lanes(const NewtonArguments& p, const NodeRange& here, double (&sum)[2]) {
+    constexpr int ALL_WARPS = ALL_LANES / 32;
+    __shared__ double warps[ALL_WARPS][2];
+    add_over_warp(sum);
+    if (threadIdx.x % 32 == 0)
+        for (int n = 0; n < 2; ++n) warps[threadIdx.x / 32][n] = sum[n];
     __syncthreads();  // all writes of this thread block are done
-    if (threadIdx.x == 0) {
-        for (int n = 0; n < 2; ++n) __stcg(p.partial_sums + 2 * blockIdx.x + n, sum[n]);
-        __threadfence();
-        last = atomicAdd(p.finished_blocks + body, 1u) == (unsigned)(end - first) - 1;
-    }
-    __syncthreads();
-    if (!last) return false;
-    __threadfence();
-    sum[0] = sum[1] = 0;
-    for (int k = first + threadIdx.x; k < end; k += THREADS)
-        for (int n = 0; n < 2; ++n) sum[n] += __ldcg(p.partial_sums + 2 * k + n);
-    sum_block<THREADS>(sum);
-    if (threadIdx.x == 0) p.finished_blocks[body] = 0;
-    return threadIdx.x == 0;
+    if (threadIdx.x >= 32) return false;
+    const int lane = threadIdx.x;
+    for (int n = 0; n < 2; ++n) sum[n] = lane < ALL_WARPS ? warps[lane][n] : 0;
+    return sum_body(p, here, blockIdx.x, sum, PARTS);
 }
 
 __device__ __forceinline__ PcgResult& result_of(const NewtonArguments& p, int body) {
@@ -111,7 +40,7 @@ __device__ __forceinline__ PcgResult& result_of(const NewtonArguments& p, int bo
 __device__ __forceinline__ void decided(const NewtonArguments& p, int body) {
     const int phase = p.search[body].phase;
 #ifdef ERRORS
-    p.phase[body] = phase == LAST ? SOLVE : phase;
+    p.phase[body] = is_awaited(phase) ? SOLVE : phase;
 #else
     p.phase[body] = phase;
 #endif
@@ -127,13 +56,27 @@ __device__ __forceinline__ void direction_of(const NewtonArguments& p, int i, bo
     for (int k = 0; k < 3; ++k) direction[k] += predictor[k];
 }
 
+// Node i within the search, read at once.
+struct SearchedNode {
+    StartOfStep start;
+    double increment[3], direction[3], beta;
+};
+__device__ __forceinline__ SearchedNode searched_node(const NewtonArguments& p, int i) {
+    SearchedNode node = {kept_start(p, i), {}, {}, (double)p.beta[i]};
+    for (int c = 0; c < 3; ++c) {
+        node.increment[c] = p.increment[3 * i + c];
+        node.direction[c] = p.direction[3 * i + c];
+    }
+    return node;
+}
+
 // Sets the state of node i to that after increment + scale direction.
-__device__ __forceinline__ void set_state(const NewtonArguments& p, int i, double scale) {
-    const long long n = 3ll * p.nodes;
-    for (int k = 3 * i; k < 3 * i + 3; ++k) {
-        const double increment = p.increment[k] + scale * p.direction[k];
-        const NodeState s = state_after(p.initial_state[k], p.initial_state[n + k], p.initial_state[2 * n + k],
-                                        p.initial_state[3 * n + k], increment, p.dx_dv, p.beta[i]);
+__device__ __forceinline__ void set_state(const NewtonArguments& p, int i, const SearchedNode& node, double scale) {
+    const StartOfStep& start = node.start;
+    for (int c = 0; c < 3; ++c) {
+        const int k = 3 * i + c;
+        const double increment = node.increment[c] + scale * node.direction[c];
+        const NodeState s = state_after(start.x[c], start.v[c], start.predictor[c], start.inertial_increment[c], increment, p.dx_dv, node.beta);
         p.x[k] = (real)s.x;
         p.v[k] = (real)s.v;
         p.predictor[k] = 0;
@@ -142,39 +85,13 @@ __device__ __forceinline__ void set_state(const NewtonArguments& p, int i, doubl
     }
 }
 
-// Begins the iteration after the first assembly of a step: keeps the state, and sets increment = -predictor.
-extern "C" __global__ void __launch_bounds__(BLOCK_NODES) begin_newton(const NewtonArguments p) {
-    const NodeRange here = p.ranges[blockIdx.x];
-    const int i = here.first + threadIdx.x;
-    double sum[2] = {0, 0};
-    if (i < here.last) {
-        const long long n = 3ll * p.nodes;
-        for (int k = 3 * i; k < 3 * i + 3; ++k) {
-            p.initial_state[k] = p.x[k];
-            p.initial_state[n + k] = p.v[k];
-            p.initial_state[2 * n + k] = p.predictor[k];
-            p.initial_state[3 * n + k] = p.inertial_increment[k];
-            p.increment[k] = -(double)p.predictor[k];
-            sum[0] += (double)p.b[k] * (double)p.b[k];
-        }
-        int k = p.row_start[i];
-        if (p.row_start[i + 1] - k > 1) {  // else fixed
-            while (p.columns[k] != i) ++k;
-            sum[1] = elastic_impulse_square(p.values + 9ll * k, p.x + 3 * i, (double)p.mass[i], p.dx_dv);
-        }
-    }
-    if (!sum_body<BLOCK_NODES>(p, here.body, sum)) return;
-    start_search(p.search[here.body], sqrt(sum[0]), EPSILON<local> * sqrt(sum[1]), p.bodies[here.body].kind);
-#ifdef ERRORS
-    p.search[here.body].forcing = MOST_FORCING;
-#endif
-    p.phase[here.body] = SOLVE;
-    p.bad_node[here.body] = NO_NODE;
-}
+// Begins the iteration where that is not done beside another kernel.
+extern "C" __global__ void __launch_bounds__(BLOCK_NODES) begin_newton(const NewtonArguments p) { begin_range(p, blockIdx.x); }
 
 #ifdef ERRORS
 // Ends a search whose state a solve has judged: adds z to the increment, which is zero where it is not to be.
-__device__ __forceinline__ void end_search(const NewtonArguments& p, int body, int i, bool mine) {
+__device__ __forceinline__ void end_search(const NewtonArguments& p, const NodeRange& here, int i, bool mine) {
+    const int body = here.body;
     Search& search = p.search[body];
     if (mine) {
         double z[3];
@@ -185,7 +102,7 @@ __device__ __forceinline__ void end_search(const NewtonArguments& p, int body, i
         }
     }
     double none[2] = {0, 0};
-    if (!sum_body<ALL_LANES>(p, body, none)) return;
+    if (!sum_lanes(p, here, none)) return;
     search.seconds += result_of(p, body).seconds;
     search.verdict = NONE_YET;
     search.phase = DONE;
@@ -193,55 +110,78 @@ __device__ __forceinline__ void end_search(const NewtonArguments& p, int body, i
 }
 #endif
 
+// q += A_ik s_k of block k, with s the search direction.
+__device__ __forceinline__ void add_block(const NewtonArguments& p, int k, int column, bool first, double (&q)[3]) {
+    double direction[3], material[3];
+    const real* a = p.values + 9ll * k;
+    direction_of(p, column, first, direction);
+    rotate_node(p.rotation + 9ll * column, true, direction, material);
+    for (int c = 0; c < 3; ++c) q[c] += a[3 * c] * material[0] + a[3 * c + 1] * material[1] + a[3 * c + 2] * material[2];
+}
+
+// A s at node i, the part of a lane. The columns of two blocks are read at once, since each read is a trip.
+__device__ __forceinline__ void multiply_row(const NewtonArguments& p, int begin, int end, int lane, bool first, double (&q)[3]) {
+    for (int k = begin + lane; k < end; k += 2 * LANES) {
+        const int other = k + LANES, column = p.columns[k], next = p.columns[other < end ? other : k];
+        add_block(p, k, column, first, q);
+        if (other < end) add_block(p, other, next, first, q);
+    }
+}
+
 // Sets the state of the next trial: along a new direction after a solve, else with a shorter step along the present one.
+// Reads that do not depend on each other stand together, since their latencies are most of its time.
 extern "C" __global__ void __launch_bounds__(ALL_LANES) update_state(const NewtonArguments p) {
+    const NodeRange here = p.ranges[blockIdx.x / PARTS];
+    const PcgResult& r = result_of(p, here.body);
+    Search& search = p.search[here.body];
+    const int i = here.first + blockIdx.x % PARTS * PART_NODES + threadIdx.x / LANES, lane = threadIdx.x % LANES;
+    const bool inside = i < here.last, mine = inside && lane == 0;
+    const int begin = inside ? p.row_start[i] : 0, end = inside ? p.row_start[i + 1] : 0;
+    const int phase = search.phase, linearizations = search.linearizations, status = r.status;
     if (blockIdx.x == 0 && threadIdx.x == 0) *p.pool_counter = 0;
     if (*p.active == 0) return;
-    const NodeRange here = p.ranges[blockIdx.x];
-    Search& search = p.search[here.body];
 #ifdef ERRORS
     if (p.phase[here.body] == DONE) return;  // that of the search may be what the solve has decided
 #else
-    if (search.phase == DONE) return;
+    if (phase == DONE) return;
 #endif
-    const int i = here.first + threadIdx.x / LANES, lane = threadIdx.x % LANES;
-    const bool inside = i < here.last, mine = inside && lane == 0;
-    if (search.phase == TRY) {
-        if (mine) set_state(p, i, search.scale);
+    if (phase == TRY) {
+        if (mine) set_state(p, i, searched_node(p, i), search.scale);
         return;
     }
-    const PcgResult& r = result_of(p, here.body);
 #ifdef ERRORS
-    if (is_over(search, r)) return end_search(p, here.body, i, mine);
+    if (is_over(search, r, p.bodies[here.body].position > 0)) return end_search(p, here, i, mine);
 #endif
-    const bool lost = r.status == NOT_FINITE, first = search.linearizations == 0;
+    const bool lost = status == NOT_FINITE, first = linearizations == 0;
     double sum[2] = {0, 0};
     if (!lost) {
-        double direction[3] = {0, 0, 0}, material[3], q[3] = {0, 0, 0};
-        if (inside)
-            for (int k = p.row_start[i] + lane; k < p.row_start[i + 1]; k += LANES) {
-                const real* a = p.values + 9ll * k;
-                direction_of(p, p.columns[k], first, direction);
-                rotate_node(p.rotation + 9ll * p.columns[k], true, direction, material);
-                for (int c = 0; c < 3; ++c) q[c] += a[3 * c] * material[0] + a[3 * c + 1] * material[1] + a[3 * c + 2] * material[2];
-            }
-        for (int k = LANES / 2; k; k >>= 1)
-            for (int c = 0; c < 3; ++c) q[c] += __shfl_xor_sync(WARP, q[c], k);
+        double direction[3] = {0, 0, 0}, material[3] = {0, 0, 0}, q[3] = {0, 0, 0};
+        SearchedNode node;
         if (mine) {
+            node = searched_node(p, i);
             direction_of(p, i, first, direction);
             rotate_node(p.rotation + 9ll * i, true, direction, material);
+        }
+        multiply_row(p, begin, end, lane, first, q);
+        for (int k = LANES / 2; k; k >>= 1)
+            for (int c = 0; c < 3; ++c) q[c] += __shfl_xor_sync(WHOLE_WARP, q[c], k);
+        if (mine) {
             for (int c = 0; c < 3; ++c) {
                 sum[0] += material[c] * q[c];
                 sum[1] += q[c] * q[c];
-                p.increment[3 * i + c] = increment_after(search, p.increment[3 * i + c], p.direction[3 * i + c]);
+                node.increment[c] = increment_after(search, node.increment[c], node.direction[c]);
+                node.direction[c] = direction[c];
+            }
+            for (int c = 0; c < 3; ++c) {
+                p.increment[3 * i + c] = node.increment[c];
                 p.direction[3 * i + c] = direction[c];
             }
-            set_state(p, i, 1);
+            set_state(p, i, node, 1);
         }
     } else if (mine) {
         for (int k = 3 * i; k < 3 * i + 3; ++k) p.increment[k] = increment_after(search, p.increment[k], p.direction[k]);
     }
-    if (!sum_body<ALL_LANES>(p, here.body, sum)) return;
+    if (!sum_lanes(p, here, sum)) return;
     record_solve(search, r.residual, r.seconds, r.iterations, r.fallbacks, r.kind, r.status);
 #ifdef ERRORS
     search.solve_error = as_known(r.solve_error);
@@ -252,11 +192,9 @@ extern "C" __global__ void __launch_bounds__(ALL_LANES) update_state(const Newto
 
 // Decides on an assembled trial: accept, shorten, or end the iteration.
 extern "C" __global__ void __launch_bounds__(BLOCK_NODES) accept_trial(const NewtonArguments p) {
-    if (*p.active == 0) return;
     const NodeRange here = p.ranges[blockIdx.x];
     Search& search = p.search[here.body];
-    if (search.phase != TRY) return;
-    const int i = here.first + threadIdx.x;
+    const int i = here.first + threadIdx.x, phase = search.phase;
     double sum[2] = {0, 0};
     if (i < here.last) {
         double material[3];
@@ -265,45 +203,52 @@ extern "C" __global__ void __launch_bounds__(BLOCK_NODES) accept_trial(const New
             const double b = p.b[3 * i + c];
             sum[0] += b * b;
             sum[1] += material[c] * b;
-            p.y[3 * i + c] = 0;  // the last solution is no initial guess for a correction
         }
     }
-    if (!sum_body<BLOCK_NODES>(p, here.body, sum)) return;
-    evaluate_trial(search, {p.linearizations, p.trials, p.tolerance}, sqrt(sum[0]), sum[1]);
+    if (*p.active == 0 || phase != TRY) return;
+    if (i < here.last)
+        for (int c = 0; c < 3; ++c) p.y[3 * i + c] = 0;  // the last solution is no initial guess for a correction
+    if (!sum_body(p, here, blockIdx.x, sum)) return;
+    Limits most = {p.linearizations, p.trials, p.tolerance};
+#ifdef BUDGETS
+    const PcgBody& settings = p.bodies[here.body];
+    if (settings.most_linearizations > 0) most.linearizations = settings.most_linearizations;
+    if (search.status == BUDGET) most.linearizations = search.linearizations;
+#endif
+    evaluate_trial(search, most, sqrt(sum[0]), sum[1]);
 #ifdef ERRORS
-    if (search.verdict == TAKEN) search.step_error = search.solve_error;
-    if (search.verdict == TAKEN && search.phase == DONE) search.phase = LAST;
+    const bool bounded = p.bodies[here.body].position > 0;
+    if (search.verdict == TAKEN && bounded) search.step_error = search.solve_error;
+    if (search.verdict == TAKEN && search.phase == DONE && (bounded || search.status == BUDGET)) search.phase = LAST;
+#endif
+#ifdef BUDGETS
+    TrialClock& clock = p.clocks[here.body];
+    clock.decided = nanoseconds();
+    clock.forces = 1e-9 * (clock.decided - clock.solved);
+    end_by_budget(search, settings, clock, *p.begun, clock.decided);
 #endif
     decided(p, here.body);
 }
 
-// Restores the state before the step, and sets y so that `advance` arrives at the state found; writes the results of the step.
-extern "C" __global__ void __launch_bounds__(BLOCK_NODES) end_newton(const NewtonArguments p) {
-    const NodeRange here = p.ranges[blockIdx.x];
-    const int body = here.body, i = here.first + threadIdx.x;
-    const Search s = p.search[body];
-    if (blockIdx.x == 0 && threadIdx.x == 0) *p.active = p.count;  // of the next step
-    if (i < here.last) {
-        const long long n = 3ll * p.nodes;
-        double increment[3], y[3];
-        bool finite = true;
-        for (int c = 0; c < 3; ++c) {
-            const long long k = 3ll * i + c;
-            increment[c] = increment_after(s, p.increment[k], p.direction[k]);
-            p.x[k] = p.initial_state[k];
-            p.v[k] = p.initial_state[n + k];
-            p.predictor[k] = p.initial_state[2 * n + k];
-            p.inertial_increment[k] = p.initial_state[3 * n + k];
-            finite = finite && isfinite(p.b[k]);
-        }
-        rotate_node(p.rotation + 9ll * i, true, increment, y);
-        for (int c = 0; c < 3; ++c) p.y[3 * i + c] = (real)y[c];
-        if (s.status == NOT_FINITE && !finite) atomicMin(p.bad_node + body, i - p.ranges[p.first_range[body]].first);
+// First node of a body whose b is not finite, -1: there is none. By a warp.
+__device__ __forceinline__ int first_bad_node(const NewtonArguments& p, const NodeRange& first_of_body) {
+    constexpr int NONE_FOUND = 0x7fffffff;
+    const int first = first_of_body.first, nodes = p.ranges[first_of_body.first_range + first_of_body.ranges - 1].last - first;
+    int bad = NONE_FOUND;
+    for (int k = threadIdx.x; k < nodes && bad == NONE_FOUND; k += 32) {
+        const real* b = p.b + 3ll * (first + k);
+        if (!(isfinite(b[0]) && isfinite(b[1]) && isfinite(b[2]))) bad = k;
     }
-    double none[2] = {0, 0};
-    if (!sum_body<BLOCK_NODES>(p, body, none)) return;
-    PcgResult& r = result_of(p, body);
+    for (int by = 16; by; by >>= 1) bad = min(bad, __shfl_xor_sync(WHOLE_WARP, bad, by));
+    return bad == NONE_FOUND ? -1 : bad;
+}
+
+// By the first thread block of a body: the results of the step.
+__device__ __forceinline__ void write_results(const NewtonArguments& p, const NodeRange& here, const Search& s) {
+    const int body = here.body, bad = s.status == NOT_FINITE ? first_bad_node(p, here) : -1;
     const PcgBody& settings = p.bodies[body];
+    if (threadIdx.x) return;
+    PcgResult& r = result_of(p, body);
     const bool used = settings.plan && (r.asked == CHOLESKY || s.kind == CHOLESKY || s.fallbacks);
     r.factor_step = used ? settings.factor_step : -1;
     r.residual = s.residual;
@@ -312,11 +257,34 @@ extern "C" __global__ void __launch_bounds__(BLOCK_NODES) end_newton(const Newto
     r.status = s.status;
     r.kind = s.kind;
     r.fallbacks = s.fallbacks;
-    const int bad = __ldcg(p.bad_node + body);
-    r.bad_node = s.status == NOT_FINITE && bad != NO_NODE ? bad : -1;
-    p.newton_results[(p.step[0] % p.capacity) * p.count + body] = {residual_ratio(s), s.linearizations > 1 ? s.linearizations : 1};
+    r.bad_node = bad;
+    NewtonResult& told = p.newton_results[(p.step[0] % p.capacity) * p.count + body];
+    told = {residual_ratio(s), s.linearizations > 1 ? s.linearizations : 1};
 #ifdef ERRORS
     r.solve_error = as_told(s.solve_error);
-    p.newton_results[(p.step[0] % p.capacity) * p.count + body].step_error = as_told(s.step_error);
+    told.step_error = as_told(s.step_error);
 #endif
+}
+
+// Restores the state before the step, and sets y so that `advance` arrives at the state found; writes the results of the step.
+extern "C" __global__ void __launch_bounds__(BLOCK_NODES) end_newton(const NewtonArguments p) {
+    const NodeRange here = p.ranges[blockIdx.x];
+    const int i = here.first + threadIdx.x;
+    const Search s = p.search[here.body];
+    if (blockIdx.x == 0 && threadIdx.x == 0) *p.active = p.count;  // of the next step
+    if (i < here.last) {
+        const SearchedNode node = searched_node(p, i);
+        double increment[3], y[3];
+        for (int c = 0; c < 3; ++c) increment[c] = increment_after(s, node.increment[c], node.direction[c]);
+        rotate_node(p.rotation + 9ll * i, true, increment, y);
+        for (int c = 0; c < 3; ++c) {
+            const int k = 3 * i + c;
+            p.x[k] = node.start.x[c];
+            p.v[k] = node.start.v[c];
+            p.predictor[k] = node.start.predictor[c];
+            p.inertial_increment[k] = node.start.inertial_increment[c];
+            p.y[k] = (real)y[c];
+        }
+    }
+    if ((int)blockIdx.x == here.first_range) write_results(p, here, s);
 }

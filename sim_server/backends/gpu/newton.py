@@ -19,14 +19,15 @@ from sim_server.arrays import Int32, Int64
 from sim_server.backends.declarations import Declarations
 from sim_server.backends.gpu.cupy_types import DeviceArray, KernelFunction
 from sim_server.backends.gpu.device import DeviceLaunch, Gpu, compiled, options, own_headers
-from sim_server.backends.gpu.kernel_fusion import FusedKernel, PhaseGuard, SolveGuard, fuse
+from sim_server.backends.gpu.kernel_fusion import DOMAINS, FusedKernel, PhaseGuard, Prologue, SolveGuard, fuse
 from sim_server.backends.gpu.solver import PcgSolver
 from sim_server.backends.gpu.structs import NEWTON_RESULT
 from sim_server.backends.newton import Newton
 
 NEWTON = Declarations("backends/gpu/newton.cu")
 BLOCK_NODES: int = NEWTON.constant("BLOCK_NODES")  # of a thread block
-LANES: int = NEWTON.constant("LANES")  # threads of a node in the kernel `update_state`
+PARTS: int = NEWTON.constant("PARTS")  # of such nodes, each of a thread block of the kernel `update_state`
+LANES: int = NEWTON.constant("LANES")  # threads of a node there
 NODE_RANGE = NEWTON.dtype("NodeRange")
 SEARCH = NEWTON.dtype("Search")
 NEWTON_ARGUMENTS = NEWTON.dtype("NewtonArguments")
@@ -75,8 +76,8 @@ class Loops(Protocol):
         ...
 
 
-def node_ranges(ranges: Int64) -> tuple[NDArray[Any], Int32]:
-    """Returns the nodes of each thread block (NODE_RANGE), and the first thread block of each body, (bodies + 1,).
+def node_ranges(ranges: Int64) -> NDArray[Any]:
+    """Returns the nodes of each thread block (NODE_RANGE).
 
     ranges: (bodies, 2), nodes [first, last) of each body.
     """
@@ -86,7 +87,15 @@ def node_ranges(ranges: Int64) -> tuple[NDArray[Any], Int32]:
     body = found["body"] = np.repeat(np.arange(len(ranges)), count)
     found["first"] = ranges[body, 0] + BLOCK_NODES * (np.arange(len(body)) - start[body])
     found["last"] = np.minimum(found["first"] + BLOCK_NODES, ranges[body, 1])
-    return found, start.astype(np.int32)
+    found["first_range"], found["ranges"] = start[body], count[body]
+    return found
+
+
+def own_blocks(row_start: Int32, columns: Int32) -> Int32:
+    """Returns the place of each node's own block, (nodes,); -1 at fixed nodes, whose rows have no other."""
+    rows = np.repeat(np.arange(len(row_start) - 1), np.diff(row_start))
+    places = np.flatnonzero(columns == rows)
+    return np.where(np.diff(row_start) > 1, places, -1).astype(np.int32)
 
 
 def bodies_of(parts: Sequence[Int32 | None]) -> Int32 | None:
@@ -100,6 +109,19 @@ def bodies_of(parts: Sequence[Int32 | None]) -> Int32 | None:
     return np.repeat(np.arange(len(first) - 1, dtype=np.int32), np.diff(first))
 
 
+def begins_beside(assemble: Sequence[DeviceLaunch], ranges: Sequence[tuple[int, int]], errors: bool) -> Prologue | None:
+    """Returns what begins the iteration beside the kernel over blocks of the first assembly; None: there is none.
+
+    errors: whether the error of positions is bounded. The arguments are those that NewtonIteration sets.
+    """
+    domains = {launch.domain for launch in assemble}
+    if not {"nodes", "blocks"} <= domains <= set(DOMAINS):
+        return None
+    text = ("#define ERRORS\n" if errors else "") + '#include "newton_begin.cuh"'
+    blocks = len(node_ranges(np.array(ranges, np.int64)))
+    return Prologue(text, "NewtonArguments", "begin_beside", np.zeros((), NEWTON_ARGUMENTS), blocks)
+
+
 class NewtonIteration:
     """Launches the Newton iteration of a step, between its first assembly and its end.
 
@@ -110,6 +132,7 @@ class NewtonIteration:
     arrays: host arrays by name (row_start, columns, values, b, y, x, v)
     results: host memory (capacity, bodies) of NEWTON_RESULT that the steps write to
     readers: launches after the step's end that read what the last assembly made
+    beside: begins the iteration within the first assembly; None: a launch of its own does
 
     The array `values` keeps A of the first linearization of a step, from which factors are made; later ones have
     another.
@@ -123,7 +146,7 @@ class NewtonIteration:
     def __init__(
         self, gpu: Gpu, device: Loops, newton: Newton, again: Sequence[DeviceLaunch], ranges: Sequence[tuple[int, int]],
         arrays: Mapping[str, NDArray[Any]], phases: NewtonPhases, solver: PcgSolver, results: NDArray[Any],
-        readers: Sequence[DeviceLaunch] = (),
+        readers: Sequence[DeviceLaunch] = (), beside: Prologue | None = None,
     ):  # fmt: skip
         cp, nodes, bodies = gpu.cp, len(arrays["x"]), len(ranges)
         self._gpu, self._device, self._solver, self.rounds = gpu, device, solver, newton.options.rounds
@@ -139,28 +162,31 @@ class NewtonIteration:
         names = ("row_start", "columns", "values", "b", "y", "x", "v")
         host = {name: arrays[name] for name in names} | newton.arrays
         twins = {name: gpu.twin(array) for name, array in host.items()}
-        spans, starts = node_ranges(np.array(ranges, np.int64))
+        spans = node_ranges(np.array(ranges, np.int64))
         self._grid, real = len(spans), twins["x"].dtype
         self._memory = twins | {
-            "ranges": cp.asarray(spans.view(np.int32)), "first_range": cp.asarray(starts),
-            "partial_sums": cp.zeros(2 * len(spans)), "finished_blocks": cp.zeros(bodies, np.uint32),
-            "search": phases.search, "phase": phases.phase, "active": phases.active,
-            "bad_node": cp.zeros(bodies, np.int32), "step": solver.counter, "pool_counter": solver.pool_counter,
+            "ranges": cp.asarray(spans.view(np.int32)),
+            "diagonal": cp.asarray(own_blocks(arrays["row_start"], arrays["columns"])),
+            "partial_sums": cp.zeros(2 * PARTS * len(spans)), "finished_blocks": cp.zeros(bodies, np.uint32),
+            "search": phases.search, "phase": phases.phase, "active": phases.active, "begun": solver.begun,
+            "clocks": solver.clocks, "step": solver.counter, "pool_counter": solver.pool_counter,
             "results": solver.results,
             "initial_state": cp.zeros(12 * nodes, real), "increment": cp.zeros(3 * nodes),
             "direction": cp.zeros(3 * nodes),
         }  # fmt: skip
-        self._params = np.zeros((), NEWTON_ARGUMENTS)
+        self._params = beside.params if beside else np.zeros((), NEWTON_ARGUMENTS)
+        self._begins_beside = beside is not None
         for name, array in self._memory.items():
             self._params[name] = array.data.ptr
         self._params["newton_results"], self._params["bodies"] = results.ctypes.data, solver.bodies_device
         self._params["dx_dv"], self._params["tolerance"] = newton.dx_dv, newton.options.tolerance
         self._params["linearizations"], self._params["trials"] = newton.options.linearizations, newton.options.trials
-        self._params["nodes"], self._params["count"] = nodes, bodies
+        self._params["nodes"], self._params["count"], self._params["grid"] = nodes, bodies, len(spans)
         self._params["capacity"] = results.nbytes // NEWTON_RESULT.itemsize // bodies
         self._later_params = self._params.copy()
         self._later_params["values"] = self._values.data.ptr
-        flags = (*options(gpu.types), *own_headers(), *(["-DERRORS"] if solver.errors else []))
+        kinds = {"ERRORS": solver.errors, "BUDGETS": solver.budgets}
+        flags = (*options(gpu.types), *own_headers(), *(f"-D{kind}" for kind, wanted in kinds.items() if wanted))
         module = gpu.cp.RawModule(code=NEWTON.checked(), options=flags, backend="nvrtc")
         self._begin, self._update_state, self._accept_trial, self._end = (
             compiled("newton.cu", module, name)
@@ -189,7 +215,8 @@ class NewtonIteration:
 
         Where graphs have loops, only while one is captured.
         """
-        self._launch(self._begin, BLOCK_NODES, self._params)
+        if not self._begins_beside:
+            self._launch(self._begin, BLOCK_NODES, self._params)
         self._trial(self._params, None)
         if self.loops:
             with self._device.repeat(self._memory["active"]):
@@ -208,10 +235,10 @@ class NewtonIteration:
     def _trial(self, params: NDArray[Any], values: DeviceArray | None) -> None:
         """Launches a solve, the state that it gives, the forces there and the decision. values: A; None: the first."""
         self._solver.launch(values)
-        self._launch(self._update_state, BLOCK_NODES * LANES, params)
+        self._launch(self._update_state, BLOCK_NODES // PARTS * LANES, params, PARTS)
         for launch in self._forces:
             launch()
         self._launch(self._accept_trial, BLOCK_NODES, params)
 
-    def _launch(self, function: KernelFunction, threads: int, params: NDArray[Any]) -> None:
-        function((self._grid,), (threads,), (params,))
+    def _launch(self, function: KernelFunction, threads: int, params: NDArray[Any], parts: int = 1) -> None:
+        function((self._grid * parts,), (threads,), (params,))

@@ -26,6 +26,9 @@
 #ifdef CORRECTED
 #include "correction.cuh"
 #endif
+#ifdef BUDGETS
+#include "step_budget.cuh"
+#endif
 
 struct BlockMemory {  // static shared memory of a thread block: data that is the same in all threads needs no registers
     double scratch[3 * WARPS][4], totals[4];
@@ -54,6 +57,10 @@ struct BlockMemory {  // static shared memory of a thread block: data that is th
     Search search;
     bool over;
     unsigned first_number;         // of the words of s.z that have the first z of a solve with a factor
+#endif
+#ifdef BUDGETS
+    long long began, deadline;     // of the solve [ns]
+    long long looked;              // at the clock, by the first thread of the first thread block
 #endif
 };
 __shared__ BlockMemory memory;
@@ -89,6 +96,9 @@ struct PcgSolver {
 #ifdef ERRORS
     double x_change = 0;    // |x - x at the last look|, of the last exchange with it
     bool enough = false;    // the estimated error ends the solve
+#endif
+#ifdef BUDGETS
+    bool spent = false;     // its time is over, as the first thread block has seen
 #endif
 
     __device__ __forceinline__ void set_up(const RowRange& range) {
@@ -276,8 +286,10 @@ struct PcgSolver {
     __device__ __forceinline__ bool ends_search(int kind, double size) {
         const PcgBody& body = memory.body;
         if (threadIdx.x == 0) {
-            memory.over = body.position > 0 && ends_by_start(memory.search, body, kind, size);
-            const double tolerance = solve_tolerance(memory.search, body.tolerance, kind), useful = fmax(tolerance, USEFUL);
+            const bool judges = body.position > 0 || memory.search.phase != SOLVE;
+            memory.over = judges && ends_by_start(memory.search, body, kind, size);
+            const double tolerance = solve_tolerance(memory.search, body.tolerance, kind);
+            const double useful = body.position > 0 ? fmax(tolerance, USEFUL) : tolerance;
             memory.goal = tolerance * tolerance * memory.b2;
             memory.quarter = memory.b2 * sqrt(useful);
         }
@@ -286,6 +298,10 @@ struct PcgSolver {
         else if (memory.search.applied) keep_first();
         return memory.over;
     }
+
+#ifdef BUDGETS
+    static __device__ __forceinline__ bool first_of_step() { return memory.search.linearizations == 0; }
+#endif
 
     // Keeps z = p where solves without a factor have theirs.
     __device__ __forceinline__ void keep_first() const {
@@ -309,6 +325,10 @@ struct PcgSolver {
         if (threadIdx.x == 0)
             note_left(memory.search, sqrt(solution2), sqrt(difference2), memory.error.first_size, solve_error, memory.body.dx_dv);
     }
+#endif
+
+#if defined(BUDGETS) && !defined(JUDGES)
+    static __device__ __forceinline__ bool first_of_step() { return true; }
 #endif
 
     // 7. 8. 2. p = z + beta p, q = A p; sums p.q, r.q, q.q, r.r
@@ -371,7 +391,11 @@ struct PcgSolver {
             }
             if (packed) publish(1 - turn, k, r);
         }
+#ifdef BUDGETS
+        double mine[2], zr[2];
+#else
         double mine[1], zr[1];
+#endif
         z_number = group.number;
         if (kind == CHOLESKY) {
             mine[0] = by_inverse(alpha, r2);
@@ -383,13 +407,25 @@ struct PcgSolver {
             mine[0] = by_diagonal(kind);
         }
         for (int k = 16; k; k >>= 1) mine[0] += __shfl_xor_sync(ALL, mine[0], k);
-#ifdef ERRORS
+#ifdef BUDGETS
+        mine[1] = group.index == 0 && threadIdx.x == 0 && looks_at_clock();
+        sums_and_change<2, 1>(mine, zr, largest2([&](int k) { return rows.x[k] - rows.before[k]; }));
+        spent = zr[1] > 0;
+#elif defined(ERRORS)
         sums_and_change<1, 1>(mine, zr, largest2([&](int k) { return rows.x[k] - rows.before[k]; }));
 #else
         group.sums<1, 1>(mine, zr);
 #endif
         return zr[0];
     }
+
+#ifdef BUDGETS
+    static __device__ __forceinline__ bool looks_at_clock() {
+        const long long now = nanoseconds(), iteration = now - memory.looked;
+        memory.looked = now;
+        return is_spent(memory.body, memory.began, memory.deadline, now, iteration);
+    }
+#endif
 
     __device__ __forceinline__ double by_diagonal(int kind) const {
         const BlockRows rows = memory.rows;
@@ -752,6 +788,9 @@ __device__ __forceinline__ void PcgSolver::solve() {
                 restart = true;
                 continue;
             }
+#ifdef BUDGETS
+            if (stop < 0 && ends_by_budget(body, spent, iterations, first_of_step())) stop = BUDGET;
+#endif
             if (stop < 0) {
                 double sums[4];
 #ifdef ERRORS
@@ -866,6 +905,21 @@ __device__ __forceinline__ void solve_body(const PcgArguments& s, const RowRange
 #endif
     }
 #endif
+#ifdef BUDGETS
+    if (threadIdx.x == 0) {
+        double reserve = 0;
+#ifdef JUDGES
+        TrialClock& clock = s.clocks[k];
+        const bool later = memory.search.linearizations > 0;
+        memory.over = false;
+        memory.body.budget = budget_left(memory.body.budget, memory.search.iterations);
+        reserve = seconds_after_solve(clock);
+        if (later && range.index == 0) clock.blocks = 1e-9 * (begin - clock.decided);
+#endif
+        memory.began = memory.looked = begin;
+        memory.deadline = deadline_of(memory.body, __ldcg(s.begun), reserve);
+    }
+#endif
     PcgSolver solver = {s, {range.index, memory.body.blocks, s.exchange_number[k], s.block_sums + 8ll * s.grid * k, s.grid, memory.scratch, memory.totals,
                          (int)threadIdx.x % 32, (int)threadIdx.x / 32
 #ifdef ERRORS
@@ -897,7 +951,12 @@ __device__ __forceinline__ void solve_body(const PcgArguments& s, const RowRange
 #endif
     if (range.index == 0 && threadIdx.x == 0) {
         PcgResult out = memory.out;
-        out.seconds = 1e-9 * (nanoseconds() - begin);
+        const long long end = nanoseconds();
+        out.seconds = 1e-9 * (end - begin);
+#if defined(BUDGETS) && defined(JUDGES)
+        s.clocks[k].solved = end;
+        if (memory.over) s.clocks[k].judging = out.seconds;
+#endif
         if (memory.body.plan && (out.asked == CHOLESKY || out.kind == CHOLESKY || out.fallbacks)) out.factor_step = memory.body.factor_step;
         PcgResult& result = s.results[(s.step[0] % s.capacity) * s.count + k];
 #ifdef STAGES

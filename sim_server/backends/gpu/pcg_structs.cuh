@@ -50,7 +50,8 @@ struct PcgBody {
     int first_range;               // first of its thread blocks in PcgArguments.row_ranges
     double tolerance;
     double position, trust, dx_dv; // see SolveSettings (backends/cpu/native/pcg.h)
-    double step_budget;            // likewise
+    double step_budget, budget;    // likewise; -DBUDGETS
+    int most_linearizations, unused;  // likewise
     long long factor_step;         // step of the matrix of the factor
     const DevicePlan* plan;        // null: no factor yet
     const uint4* matrix;           // chunks
@@ -62,6 +63,13 @@ struct PcgBody {
     FlagWord<float>* solved;       // (size + 32,) z / d
     FlagWord<float>* contributed;  // contributions of parts below
     int planes;                    // float16 numbers per entry of the inverse
+};
+
+// Wall time of a body's search, on the device's clock, as it took last (step_budget.cuh).
+struct TrialClock {
+    long long solved, decided;     // ends of the last solve and of the last decision on a trial [ns]
+    double forces, blocks;         // from a solve to the decision on its trial, and on to the next solve [s]
+    double judging;                // of a solve that only judged a state [s]
 };
 
 struct PcgArguments {
@@ -87,6 +95,8 @@ struct PcgArguments {
     unsigned* pool_counter;        // (1,) zero at launch; bodies of the pool that were taken
     const long long* step;         // number of completed steps, which selects the slot of the result
     PcgResult* results;            // (capacity, bodies)
+    const long long* begun;        // (1,) time at which the step began [ns]
+    TrialClock* clocks;            // (bodies,)
     const int* moving;             // (bodies,) 0: the body rests (kernels/nodes.cu)
     int nodes, shared;             // of the scene; bytes of dynamic shared memory
 };

@@ -22,7 +22,7 @@ from sim_server.backends.gpu.structs import CONTACT, CORRECTION, PCG, PCG_RESULT
 PCG_BODY = PCG.dtype("PcgBody")
 SETTINGS_BYTES = PCG_BODY.fields["factor_step"][1]  # type: ignore[index]
 """Bytes of a PCG_BODY before the factor: the settings."""
-PCG_ARGUMENTS = PCG.dtype("PcgArguments")
+PCG_ARGUMENTS, TRIAL_CLOCK = PCG.dtype("PcgArguments"), PCG.dtype("TrialClock")
 
 
 def threads_and_blocks(nodes: Int64, processors: int) -> tuple[int, int]:
@@ -46,6 +46,7 @@ class PcgSolver:
     between: True if bodies touch each other, or are tied, there (island_state.cuh)
     correction: of factors for grabs and contacts; None: they are not corrected
     errors: True for a scene whose solves estimate the errors of positions (iterate_error.cuh)
+    budgets: True for a scene whose solves may end by their wall time (step_budget.cuh); they estimate errors, too
 
     params: arguments of the kernel (PCG_ARGUMENTS)
     bodies: host rows (PCG_BODY), one per body. The loop uploads the settings (the first SETTINGS_BYTES bytes of a row)
@@ -58,11 +59,12 @@ class PcgSolver:
     def __init__(
         self, gpu: Gpu, ranges: Sequence[tuple[int, int]], arrays: Mapping[str, NDArray[Any]], counter: DeviceArray,
         capacity: int, planes: int = 1, phases: Sequence[DeviceArray] = (), attempts: int = 0, contact: bool = False,
-        between: bool = False, correction: FactorCorrection | None = None, errors: bool = False,
+        between: bool = False, correction: FactorCorrection | None = None, errors: bool = False, budgets: bool = False,
     ):  # fmt: skip
         cp, processors = gpu.cp, gpu.properties["multiProcessorCount"]
         self.gpu, self.counter, self._capacity, self.planes, self._phases = gpu, counter, capacity, planes, phases
         self._attempts, self._contact, self._correction, self.errors = attempts, contact, correction, errors
+        self.budgets = budgets
         self._twins = {name: gpu.twin(arrays[name]) for name in ("row_start", "values", "b", "y", "moving")}
         self.real = np.dtype(self._twins["values"].dtype)
         self._types = {"real": "float" if self.real == np.float32 else "double"}
@@ -94,6 +96,7 @@ class PcgSolver:
             "block_sums": cp.zeros((20 if errors else 16) * self.grid * len(ranges)),
             "exchange_number": cp.ones(len(ranges), np.uint32),  # unwritten words have the number 0
             "pool_counter": self.pool_counter, "results": self.results, "step": counter,
+            "begun": cp.zeros(1, np.int64), "clocks": cp.zeros(len(ranges) * TRIAL_CLOCK.itemsize, np.uint8),
         }  # fmt: skip
         fixed = 5120 if correction else 2048  # bytes: shared memory that pcg.cu declares, and the driver's
         self._shared = (gpu.properties["sharedMemPerMultiprocessor"] // blocks - fixed - 1024) // 16 * 16
@@ -111,6 +114,16 @@ class PcgSolver:
         """Address of the rows of the bodies on the device."""
         return int(self._rows.data.ptr)
 
+    @property
+    def begun(self) -> DeviceArray:
+        """Time at which the step under way began, on the device's clock [ns], (1,); the end of a step writes it."""
+        return self._work["begun"]
+
+    @property
+    def clocks(self) -> DeviceArray:
+        """Wall times of the searches of the bodies (TRIAL_CLOCK)."""
+        return self._work["clocks"]
+
     def _compiled(self, name: str, blocks: int) -> KernelFunction:
         """Compiles the kernel of the text <name>.cu for `blocks` thread blocks a multiprocessor."""
         declared = STAGES if self._attempts else CONTACT if self._contact else PCG
@@ -124,6 +137,7 @@ class PcgSolver:
                 *(["-DNEWTON_PHASES"] if self._phases else []), *(["-DSTAGES"] if self._attempts else []),
                 *(["-DCONTACT_PASSES"] if self._contact else []), *(["-DCORRECTED"] if corrected else []),
                 *(["-DERRORS"] if self.errors and name == "pcg" else []),
+                *(["-DBUDGETS"] if self.budgets and name == "pcg" else []),
             ),
             backend="nvrtc",
             enable_cooperative_groups=True,

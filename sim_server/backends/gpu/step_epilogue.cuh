@@ -12,6 +12,7 @@ struct StepEpilogue {
     unsigned* finished_blocks;  // (1,) zero between launches
     long long* timestamps;      // (capacity, 2) on the host: begin and end of each step [ns]; a step begins at the end of the one before,
                                 // or at the time of `stamp_begin`
+    long long* begun;           // (1,) as the timestamps: of the step under way
     const long long* results;   // (capacity, result_words)
     long long* host_results;    // the same on the host
     int* moving;                // (bodies,)
@@ -41,6 +42,7 @@ __device__ __forceinline__ void end_step(const StepEpilogue& t) {
         long long now = nanoseconds();
         t.timestamps[2 * slot + 1] = now;
         t.timestamps[2 * ((done + 1) % t.capacity)] = now;
+        t.begun[0] = now;
         t.finished_blocks[0] = 0;
         t.step[0] = done + 1;
         t.clock[0] = (done + 1) * t.dt;
@@ -48,4 +50,6 @@ __device__ __forceinline__ void end_step(const StepEpilogue& t) {
 }
 
 // Writes the time at which the next step begins, where the device was idle before.
-extern "C" __global__ void stamp_begin(const StepEpilogue t) { t.timestamps[2 * (t.step[0] % t.capacity)] = nanoseconds(); }
+extern "C" __global__ void stamp_begin(const StepEpilogue t) {
+    t.timestamps[2 * (t.step[0] % t.capacity)] = t.begun[0] = nanoseconds();
+}
