@@ -25,8 +25,8 @@ if TYPE_CHECKING:
     from sim_server.backends.contact import Contact
     from sim_server.backends.energies import Energies
     from sim_server.backends.euler_form import EulerForm
-    from sim_server.backends.measured import Measured
     from sim_server.backends.halving import Halving
+    from sim_server.backends.measured import Measured
     from sim_server.backends.newton import Newton
     from sim_server.backends.rank_one import RankOne
     from sim_server.backends.rosenbrock import Rosenbrock
