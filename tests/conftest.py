@@ -3,6 +3,7 @@
 
 import os
 import signal
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -22,6 +23,10 @@ TOGETHER = {
     "tests/web/": "real time",
 }
 
+# Tests that take seconds each beside others of their kind that do not, a node id a line. They are marked `long`:
+# deploy/run test leaves them out, deploy/run test --all and every other call of pytest run them.
+LONG = Path(__file__).with_name("long_tests.txt")
+
 
 def pytest_configure() -> None:
     """Programs that tests start end on Ctrl-C, also where a shell started the tests in the background: it lets them
@@ -30,16 +35,22 @@ def pytest_configure() -> None:
         signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
+@pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """Of several processes one begins with what takes longest because it waits, so that no other has to wait for it.
 
-    A test of real processes that fails is made once more: it shares cores and network with the rest of the machine.
-    What failed first is printed at the end (`pytest_terminal_summary`), so that it is not lost.
+    A test of real processes, or beside them, that fails is made once more: it shares cores and network with the rest
+    of the machine. What failed first is printed at the end (`pytest_terminal_summary`), so that it is not lost.
     """
     if hasattr(config, "workerinput"):
         items.sort(key=lambda item: _group(item.nodeid) != "real time")
+    long = set(LONG.read_text().splitlines())
+    if config.args_source is config.ArgsSource.TESTPATHS and (unknown := long - {item.nodeid for item in items}):
+        raise pytest.UsageError(f"{LONG}: no such test: {', '.join(sorted(unknown))}")
     for item in items:
-        if item.get_closest_marker("system"):
+        if item.nodeid in long:
+            item.add_marker(pytest.mark.long)
+        if item.get_closest_marker("system") or _group(item.nodeid) == "real time":
             item.add_marker(pytest.mark.flaky(reruns=1))
 
 

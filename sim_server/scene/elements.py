@@ -17,7 +17,7 @@ LAWS = ("arruda_boyce", "costa", "mooney_rivlin", "neo_hookean", "ogden", "stabl
 PATCHED = ("arruda_boyce", "mooney_rivlin", "neo_hookean", "stable_neo_hookean", "veronda_westmann")  # may be "patch"
 
 
-REMEMBERING = ("damage", "plasticity", "prony")  # beside laws of linear tetrahedra
+REMEMBERING = ("damage", "plasticity", "poroelasticity", "prony")  # beside laws of linear tetrahedra
 
 
 class HasElements(Protocol):

@@ -337,6 +337,7 @@ LAW_ELEMENTS = [
     ("effects/prony.cu", "PronyElements", "prony.elements"),
     ("effects/plasticity.cu", "PlasticElements", "plasticity.elements"),
     ("effects/damage.cu", "DamageElements", "damage.elements"),
+    ("effects/poroelasticity.cu", "PoreElements", "poroelasticity.elements"),
 ]
 LAW_PATCHES = [
     (f"{PATCH_FRAMES[1]}+effects/neo_hookean.cuh", "PatchPressures", "neo_hookean.pressures"),

@@ -77,6 +77,11 @@ SCENES = {
         "solver.precision=mixed",
         "integrator.linearizations=3",
     ),
+    "beam.toml, poroelasticity, mixed": (
+        "object.beam.effects.poroelasticity.mobility=1e-9",
+        "object.beam.effects.poroelasticity.storage=1e7",
+        "solver.precision=mixed",
+    ),
     "beam.toml, plasticity, mixed, Newton": (
         "object.beam.effects.plasticity.yield_stress=1e3",
         "solver.precision=mixed",

@@ -43,7 +43,8 @@ def test_other_schemes_go_on_as_on_a_cpu(scheme):
         cut(sim, NOTCH)
         sim.engine.run(12)
         ends.append(sim.fetch().x.copy())
-    np.testing.assert_allclose(ends[0], ends[1], atol=1e-5)
+    bound = 2e-4 if scheme == "central_difference" else 1e-5  # substeps come in fours on a GPU
+    np.testing.assert_allclose(ends[0], ends[1], atol=bound)
 
 
 @pytest.mark.parametrize("precision", ["float64", "mixed", "float32"])

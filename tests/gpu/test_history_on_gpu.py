@@ -7,7 +7,7 @@ import pytest
 from tests.resets.state_scenes import made
 
 pytestmark = pytest.mark.gpu
-REMEMBERING = ("prony", "prony, friction, bdf2", "plasticity", "damage")
+REMEMBERING = ("prony", "prony, friction, bdf2", "plasticity", "damage", "poroelasticity")
 
 
 @pytest.mark.parametrize("name", [n for n in REMEMBERING if "friction" not in n])

@@ -59,7 +59,7 @@ def test_every_effect_with_elements_is_a_model_of_the_hard_cases() -> None:
         "traction",
         "wind",
     }
-    others |= {"cutting", "damage", "plasticity", "prony"}  # beside laws that are: test_memory_of_materials.py
+    others |= {"cutting", "damage", "plasticity", "poroelasticity", "prony"}  # beside laws: test_memory_of_materials.py
     assert {model.effect for model in MODELS.values()} == set(known_effects()) - others
 
 

@@ -55,6 +55,7 @@ LAWS = {
 }  # fmt: skip
 VISCOUS = {"prony": {"terms": [{"g": 0.8, "tau": 0.05}, {"g": 0.3, "tau": 1.0}], "shear": 1e5}}
 FLOWING = {"plasticity": {"yield_stress": 300.0, "hardening": 1e3}}
+POROUS = {"poroelasticity": {"mobility": 1e-6, "storage": 1e6, "drained": "X > 0.39"}}
 TEARING = {"damage": {"strength": 500.0, "fracture_energy": 1.0}}
 MIXED = bar(cells=(2, 2, 2), size=(0.2, 0.2, 0.2), name="cube", density=1000, young=None) | {"effects": LAWS}
 LOADS = {
@@ -90,6 +91,7 @@ SCENES: dict[str, dict[str, Any]] = {
     "damage": table(
         [remembering(beam(), TEARING), beam(name="other", pose={"translate": [0, 0, 1]})], integrator=NEWTON
     ),
+    "poroelasticity": table([remembering(beam(), POROUS), beam(name="other", pose={"translate": [0, 0, 1]})]),
     "loaded": table([beam() | {"effects": beam()["effects"] | LOADS}]),
     "held": table(
         [beam()], holder=[{"name": "hand", "object": "beam", "where": "X > 0.39", "moved": "client", "max_speed": 0.5}]

@@ -58,6 +58,7 @@ SAMPLES: dict[str, Sample] = {
     "neo_hookean": Sample(LAW),
     "ogden": Sample({"mu": [4e5, 1e4], "alpha": [1.3, 5.0], "bulk": BULK}),
     "plasticity": Sample({"yield_stress": 1e4}),
+    "poroelasticity": Sample({"mobility": 1e-9, "storage": 1e6}),
     "prony": Sample({"terms": [{"g": 0.5, "tau": 0.1}]}),
     "rayleigh": Sample({"mass": 0.5, "stiffness": 0.01}),
     "st_venant_kirchhoff": Sample(LAW),

@@ -25,18 +25,21 @@ TETS = 3 * 3 * 10 * 6
 
 def cut_about(client: Client) -> None:
     """A blade, a sphere, a region and numbers; what is refused; a cut under a grab."""
+    until(lambda: fresh(client).step > 2, "it moves")
+    client.pause()  # a command takes as long to start as all steps
     tip = client.meshes()["beam"]
     assert len(tip.tets) == TETS and tip.uncut is None
     with client.grab("beam", "tip", radius=0.5, stiffness=1e4) as held:
         reply = client.cut("beam", where="Z > 3.8 and X > 0.6")
         assert reply.removed > 0 and reply.left == TETS - reply.removed
+        client.step(3)
         held.move((1, 2, 4))
         again = client.cut("beam", where="Z > 3.8 and X > 0.6")
         assert (again.removed, again.left) == (0, reply.left)
     where = ("--connect", endpoint_of(client))
     said = run("clients", "cut", "--object", "beam", "--sphere", "0.5", "0.5", "0.7", "0.4", "--json", *where)
     assert said.returncode == 0 and json.loads(said.stdout)["left"] < reply.left, said.stderr
-    client.pause()
+    client.step(5)
     blade = "-5 -20 1.45, 5 -20 1.45, 5 20 1.45, -5 20 1.45"
     said = run("clients", "cut", "--object", "beam", "--blade", blade, *where)
     assert said.returncode == 0 and "elements removed" in said.stdout, said.stderr

@@ -116,9 +116,9 @@ def test_sets_and_resets_before_the_same_step_are_repeated_in_their_order(
         service = Service(Simulation.load(scene), link, recorder, realtime=False)
         service.engine.loop.pause = 1
         monkeypatch.setattr(link, "commands", lambda: [(c, replies.append) for c in (given.pop(0) if given else [])])
+        wanted = len(given[0])
         thread = threading.Thread(target=service.run)
         thread.start()
-        wanted = len(given[0])
         for wave in waves:
             given.append(wave)
             wanted += len(wave)

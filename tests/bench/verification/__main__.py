@@ -9,7 +9,7 @@ from typing import Annotated, Any
 import typer
 
 from tests.bench.harness.report import Report, plots
-from tests.bench.verification import actuation, bending, laws, locking, memory, motion, nafems, static, tearing
+from tests.bench.verification import actuation, bending, laws, locking, memory, motion, nafems, pores, static, tearing
 from tests.bench.verification.row import Row
 
 ABOUT = """\
@@ -38,7 +38,7 @@ STATIC: list[tuple[str, Callable[[list[int]], tuple[list[Row], static.Curves]], 
 OTHERS = [
     laws.slopes, laws.patch, laws.uniaxial, motion.time_orders, motion.momentum, motion.energies,
     motion.preconditioners, *bending.CASES, nafems.stresses, memory.viscoelasticity, memory.plasticity,
-    tearing.damage, *actuation.CASES,
+    pores.poroelasticity, tearing.damage, *actuation.CASES,
 ]  # fmt: skip
 LOCKING = """\
 Sag of a clamped bar of 1 x 1 x 4 m under a small weight over what it should be, by Poisson's ratio: the mean of the
