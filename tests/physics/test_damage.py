@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 
 from sim_server.errors import InputError
 from sim_server.simulation import Simulation
-from tests.bench.verification.tearing import AREA, ENERGY, OPENING, STRENGTH, YOUNG, expected, torn
 from tests.reference import history as reference
 from tests.scenes import bar, elastic, simulation
+from tests.support.tearing import AREA, ENERGY, OPENING, STRENGTH, YOUNG, expected, torn
 
 POISSON = 0.3
 LAW = {"young": YOUNG, "poisson": POISSON}

@@ -7,8 +7,8 @@ import pytest
 from sim_server.effects.poroelasticity import Poroelasticity
 from sim_server.errors import InputError
 from sim_server.simulation import Simulation
-from tests.bench.verification.pores import LOAD, STORAGE, YOUNG, column, consolidation, settlement
 from tests.scenes import bar, simulation
+from tests.support.consolidation import LOAD, STORAGE, YOUNG, column, consolidation, settlement
 
 
 def fluid_of(sim: Simulation) -> Poroelasticity:
