@@ -15,6 +15,7 @@ from sim_server.service.telemetry import Telemetry
 from sim_server.simulation import Simulation
 from sim_server.state.start import Start
 from sim_server.updates.driver import Driver
+from tests.cutting.cut_scenes import cut, made
 from tests.log.test_replay_of_factors import replayed
 from tests.physics.test_runaway import SCHEMES, WILD, released, wild
 from tests.resets.going_on import differing, resumed
@@ -173,6 +174,28 @@ def test_devices_and_materials_that_do_not_have_it_refuse_it():
     effects = {"corotational": {"young": 1e5, "poisson": 0.3}, "prony": {"terms": [{"g": 0.5, "tau": 0.1}]}}
     with pytest.raises(InputError, match="with the effect prony, whose memory advances by whole steps"):
         simulation(bar(young=None, effects=effects), on_runaway="halve")
+
+
+def test_a_body_that_was_cut_and_one_that_is_held_go_on():
+    """Both are far out of shape; the hand comes to hold the tip as it holds that of a body that never was."""
+    table = {"preconditioner": "block_jacobi", "tolerance": 1e-8, "max_iterations": 3000, "on_runaway": "halve"}
+    sim = made("neo_hookean", solver=table)
+    cut(sim, "X > 0.8 and X < 1.2 and Y > 0.25")
+    sim.engine.run(3)
+    sim.world.x[:], sim.world.v[:] = sim.world.rest * [4.5, 1, 1], 0
+    sim.engine.records()
+    sim.engine.run(30)
+    records = sim.engine.records()
+    assert records["halvings"].any() and (records["status"] == pb.CONVERGED).all()
+    ends = []
+    for names, tip in (((), 2.0), (("wild",), 6.0)):
+        held = bar((4, 2, 2), (2, 0.5, 0.5), name="wild", young=None, effects=WILD | {"touch": {"max_force": 1e5}})
+        sim = released(held, names=names, on_runaway="halve")
+        sim.touch.grab("anna", "wild", (tip, 0.5, 0.5), 0.0, (2.3, 0.8, 0.5), 1e5, 1e5, 1e3)
+        sim.engine.run(200)
+        ends.append((sim.world.x.copy(), sim.engine.records()["halvings"].any()))
+    assert ends[1][1] and not ends[0][1]
+    np.testing.assert_allclose(ends[0][0], ends[1][0], atol=2e-3)
 
 
 def test_a_law_that_is_not_defined_inside_out_is_kept_within_it():
