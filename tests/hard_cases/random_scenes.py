@@ -113,7 +113,7 @@ def bodies(draw: Draw, index: int, scheme: str) -> Table:
     mesh = {"bar": cells, "size": [size, size * draw(st.sampled_from((1.0, 0.5, 0.05))), size]}
     mesh["split"] = draw(st.sampled_from(("mirrored", "kuhn")))
     if draw(st.booleans()):
-        sliver = draw(st.sampled_from((1.0, 0.1, 1e-3)))
+        sliver = 1.0 if scheme == "central_difference" else draw(st.sampled_from((1.0, 0.1, 1e-3)))
         mesh = {
             "made": {
                 **mesh,
