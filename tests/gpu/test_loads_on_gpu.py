@@ -36,7 +36,8 @@ LOADS: dict[str, Any] = {
 BOUND = {"float64": 1e-11, "mixed": 5e-5, "float32": 5e-4}  # of the largest entry
 SCHEMES: dict[str, dict[str, Any]] = {
     "backward Euler": {}, "three linearizations": {"linearizations": 3}, "newmark": {"scheme": "newmark"},
-    "ros2, iterations": {"scheme": "ros2", "solve": "iterate"}, "ros2": {"scheme": "ros2"}, "substeps": {"scheme": "central_difference"},
+    "ros2, iterations": {"scheme": "ros2", "solve": "iterate"}, "ros2": {"scheme": "ros2"},
+    "substeps": {"scheme": "central_difference"},
 }  # fmt: skip
 
 

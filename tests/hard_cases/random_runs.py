@@ -15,6 +15,7 @@ from sim_server.effects._movable import MoveError
 from sim_server.effects.touch import TouchError
 from sim_server.errors import InputError
 from sim_server.mechanics.removal import KEY, text_of
+from sim_server.mechanics.world import Body
 from sim_server.mesh import bar
 from sim_server.parameters import BadParameter, toml
 from sim_server.scene.live import LiveField
@@ -249,19 +250,32 @@ def untrue(sim: Simulation, records: NDArray[Any], away: set[int]) -> list[str]:
             continue
         if not finite:
             continue
-        kinetic = 0.5 * float(w.mass[part] @ (w.v[part] ** 2).sum(axis=1))
-        if (
-            w.inertia
-            and abs(kinetic - record["kinetic"]) > 1e-9 * kinetic + 1e-300
-            and status != RUNAWAY
-            and kinetic < MOST
-        ):
-            found.append(f"object {body.name}: kinetic energy {kinetic:g} J, told {record['kinetic']:g}")
+        if w.inertia and status not in (RUNAWAY, NOT_FINITE):  # these tell of the state that was given up
+            found += [f"object {body.name}: {c}" for c in _energy_of(sim, body, record)]
         if status == CONVERGED:
             found += [f"object {body.name}: {c}" for c in unsolved(sim, body.index, record)]
         one = scene.integrator.linearizations == 1  # else the residual is that of the last of them
         if one and status == CONVERGED and record["contacts"] and not record["contact_residual"] <= _tolerance(sim):
             found.append(f"object {body.name}: contact residual {record['contact_residual']:g}, told converged")
+    return found
+
+
+def _energy_of(sim: Simulation, body: Body, record: Any) -> list[str]:
+    """What is wrong with the kinetic energy of a step that is not told to run away (kernels/energy_balance.cuh)."""
+    w, part = sim.world, body.nodes
+    kinetic, told = 0.5 * float(w.mass[part] @ (w.v[part] ** 2).sum(axis=1)), float(record["kinetic"])
+    if kinetic > MOST:
+        return []
+    found = []
+    if abs(kinetic - told) > 1e-9 * kinetic + 1e-300:
+        found.append(f"kinetic energy {kinetic:g} J, told {told:g}")
+    size = 10 * float(np.linalg.norm(np.ptp(w.rest[part], axis=0)))
+    floor = 0.5 * float(w.mass[part].sum()) * (1e-3 * size / w.dt) ** 2
+    bounded = not w.loading and not w.explicit and np.isfinite(record["budget"])
+    if bounded and not told <= 2 * max(float(record["budget"]), 0.0) * (1 + 1e-9) + floor:
+        found.append(
+            f"kinetic energy {told:g} J, more than twice what it was given, {record['budget']:g} J, and not told"
+        )
     return found
 
 

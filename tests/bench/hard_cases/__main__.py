@@ -1,17 +1,24 @@
 # SPDX-License-Identifier: MIT
-"""Runs the tables of hard cases (tests/hard_cases/table.py, models.py) and writes what was measured."""
+"""Runs the tables of hard cases (tests/hard_cases/table.py, models.py, effect_table.py) and writes what was measured.
 
-import tempfile
+On a GPU all precisions by one call: --device gpu --precision float64 --precision mixed --precision float32 --jobs 16.
+"""
+
+from collections import Counter
 from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
 import typer
 
+from tests.bench.hard_cases.running import Runs, of_precision
 from tests.bench.harness.report import Report, plots
 from tests.hard_cases.case import Case
+from tests.hard_cases.effect_table import EFFECT_CASES
+from tests.hard_cases.long_runs import LONG_RUNS
 from tests.hard_cases.models import MODEL_CASES, MODELS, QUICK, SITUATIONS
-from tests.hard_cases.running import Outcome, broken, finer, run_case, unexpected
+from tests.hard_cases.of_effects import SEEDS, EffectCase, EffectOutcome
+from tests.hard_cases.running import Outcome, broken, unexpected
 from tests.hard_cases.seeds import SEEDED, SPLITS, tally
 from tests.hard_cases.table import CASES
 
@@ -146,28 +153,140 @@ def picture(results: list[tuple[Case, Outcome]]) -> Any:
     return figure
 
 
+EFFECTS_ABOUT = """\
+## Effects
+
+Contact, cuts, materials that remember, loads and holders (tests/hard_cases/effect_table.py), each of {seeds} seeds:
+numbers are finite, steps are solved or say how they ended, and the figure of *must hold* is at most what stands there.
+*holds*: of how many seeds; *worst*: of them. *status*: of all steps of all objects.
+"""
+LONG_ABOUT = """\
+## Long runs
+
+A bar of four cells (tests/hard_cases/long_runs.py). *memory*: of the process, grown since a tenth of the run. *cost*:
+processor time of a step in the last tenth over that in the second.
+"""
+PRECISION_ABOUT = """\
+## On the device, by precision
+
+Device {device}: how many of the cases hold, of one seed, and which do not. In mixed and single precision solves may end
+at rounding (status max_iterations), positions are compared to 1e-3 of the length, and the energy may rise by rounding:
+1e-5 of what is dissipated in mixed, 1e-3 in single precision. *left out*: for lack of time.
+"""
+
+
+def effect_row(case: EffectCase, found: list[EffectOutcome]) -> dict[str, Any]:
+    """Measured of all seeds, beside what must hold."""
+    holding, status = sum(not out.wrong for out in found), sum((out.status for out in found), Counter[str]())
+    bad = {name: count for name, count in status.items() if name != "converged"}
+    iterations = np.concatenate([out.iterations for out in found])
+    wrong = sorted({each for out in found for each in out.wrong})
+    return {
+        "case": f"**{case.name}**", "what is done": case.done, "must hold": f"{case.must} {case.most:g}",
+        "holds": f"{holding} of {len(found)}" + (f": {'; '.join(wrong)}" if wrong else ""),
+        "worst": f"{max(out.value for out in found):.3g}",
+        "status": ", ".join(f"{n} × {name}" for name, n in bad.items()) or "converged",
+        "iterations mean / max": f"{iterations.mean():.1f} / {iterations.max():.0f}",
+    }  # fmt: skip
+
+
+def effects(report: Report, runs: Runs, quick: bool) -> None:
+    """The table of effects."""
+    cases, seeds = (EFFECT_CASES[5:8], 1) if quick else (EFFECT_CASES, SEEDS)
+    jobs = [("effect", EFFECT_CASES.index(case), seed, "") for case in cases for seed in range(seeds)]
+    found = runs.all(jobs)
+    rows = []
+    for case in cases:
+        of_case = [out for job, out in found if EFFECT_CASES[job[1]] is case]
+        rows += [effect_row(case, of_case)] if of_case else []
+    report.say(EFFECTS_ABOUT.format(seeds=seeds))
+    report.table(rows)
+    report.data["effects"] = rows
+
+
+def long_runs(report: Report, runs: Runs, quick: bool) -> None:
+    """The table of long runs."""
+    rows = []
+    for job, out in runs.all([("long", k, int(quick), "") for k in range(1 if quick else len(LONG_RUNS))]):
+        run = LONG_RUNS[job[1]]
+        rows.append({
+            "run": f"**{run.name}**", "what is done": run.done, "steps": 1000 if quick else run.steps,
+            "must hold": f"{run.must} {run.most:g}", "holds": "; ".join(out.wrong(run)) or "yes",
+            "drift": f"{out.drift:.1e}", "memory, MiB": f"{out.growth:.1f}", "cost": f"{out.cost:.2f}",
+            "iterations": f"{out.iterations:.1f}",
+        })  # fmt: skip
+    report.say(LONG_ABOUT)
+    report.table(rows)
+    report.data["long"] = rows
+
+
+def by_precision(report: Report, device: str, precisions: list[str], jobs: int, limit: float, quick: bool) -> None:
+    """The cases, effects and models on a device, by precision."""
+    rows = []
+    cases = CASES[::12] if quick else CASES
+    wanted = [("case", CASES.index(case), 0, p) for case in cases for p in precisions]
+    wanted += [("effect", k, 0, p) for k in range(2 if quick else len(EFFECT_CASES)) for p in precisions]
+    wanted += [("model", k, 0, p) for k in range(1 if quick else len(QUICK)) for p in precisions]
+    found = Runs(jobs, device, limit).all(wanted)
+    for precision in precisions:
+        for kind, what in (("case", "cases"), ("effect", "effects"), ("model", "models")):
+            all_jobs = [job for job in wanted if job[0] == kind and job[3] == precision]
+            done = [(job, out) for job, out in found if job[0] == kind and job[3] == precision]
+            wrong = {name: text for job, out in done for name, text in [verdict_of(job, out)] if text}
+            rows.append({
+                "precision": precision, "of": what, "hold": f"{len(done) - len(wrong)} of {len(done)}",
+                "left out": len(all_jobs) - len(done),
+                "do not": "<br>".join(f"*{name}*: {text}" for name, text in wrong.items()) or "–",
+            })  # fmt: skip
+    report.say(PRECISION_ABOUT.format(device=device))
+    report.table(rows)
+    report.data["precisions"] = rows
+
+
+def verdict_of(job: tuple[str, int, int, str], out: Any) -> tuple[str, str]:
+    """Name of a case, and what does not hold, or how the run ended."""
+    kind, index = job[:2]
+    name = {"case": CASES, "effect": EFFECT_CASES, "model": QUICK}[kind][index].name
+    if isinstance(out, str):
+        return name, out
+    if kind == "effect":
+        return name, "; ".join(out.wrong)
+    case = of_precision((CASES if kind == "case" else QUICK)[index], job[3])
+    return name, "; ".join(unexpected(case, out))
+
+
 def main(
     quick: Annotated[bool, typer.Option("--quick", help="A smoke run of a few cases")] = False,
+    device: Annotated[str, typer.Option(help="cpu, or gpu: then the table by precision alone")] = "cpu",
+    precision: Annotated[list[str] | None, typer.Option(help="Of a GPU, one or more [default: float64]")] = None,
+    jobs: Annotated[int, typer.Option(min=1, help="Processes")] = 1,
+    limit: Annotated[float, typer.Option(min=0, help="Seconds after which cases of a GPU are left out, 0: never")] = 0,
+    long: Annotated[bool, typer.Option("--long", help="Long runs, too: up to a million steps")] = False,
     out: Annotated[Path | None, typer.Option(help="Folder of the results [default: out/bench/hard_cases]")] = None,
 ) -> None:
     """Hard cases: what must hold, and what was measured."""
+    if device == "gpu" or precision:
+        told = {"device": device, "precision": " ".join(precision or ["float64"])}
+        report = Report("hard_cases", "Hard cases", told, out, quick)
+        by_precision(report, device, precision or ["float64"], jobs, limit, quick)
+        report.write()
+        return
     cases, models = (CASES[::12], QUICK[::9]) if quick else (CASES, MODEL_CASES)
-    report = Report("hard_cases", "Hard cases", {"cases": len(cases), "of models": len(models)}, out, quick)
-    results, rises = measured(cases)
+    counts = {"cases": len(cases), "of models": len(models), "of effects": len(EFFECT_CASES)}
+    report = Report("hard_cases", "Hard cases", counts, out, quick)
+    runs = Runs(jobs)
+    results, rises = measured(cases, runs)
     rows = [row(case, outcome, rise) for (case, outcome), rise in zip(results, rises, strict=True)]
     report.say(ABOUT)
     report.table(rows)
     report.say("### Notes", notes(cases))
     report.figure(picture(results), "hard_cases.png", "Iterations of each case.")
-    of_models, rises = measured(models)
+    effects(report, runs, quick)
+    if long or quick:
+        long_runs(report, runs, quick)
+    of_models, rises = measured(models, runs)
     model_rows = [model_row(case, outcome, rise) for (case, outcome), rise in zip(of_models, rises, strict=True)]
-    report.say(MODELS_ABOUT)
-    report.table([{"situation": name, "what is done": done} for name, (done, _) in SITUATIONS.items()])
-    report.say("*yes*: all of what must hold; *rises*: all of it, where the energy may rise; *refused*: by its name.")
-    report.table(matrix(of_models))
-    report.say("### Each case")
-    report.table(model_rows)
-    report.say("### Notes on models", notes(models))
+    tell_models(report, of_models, model_rows, models)
     seeded = random_starts(quick)
     report.say(SEEDS_ABOUT.format(seeds=1 if quick else 16))
     report.table(seeded)
@@ -182,17 +301,24 @@ def main(
         raise typer.Exit(1)
 
 
-def measured(cases: list[Case]) -> tuple[list[tuple[Case, Outcome]], list[float | None]]:
+def tell_models(
+    report: Report, found: list[tuple[Case, Outcome]], rows: list[dict[str, Any]], cases: list[Case]
+) -> None:
+    """The tables of models."""
+    report.say(MODELS_ABOUT)
+    report.table([{"situation": name, "what is done": done} for name, (done, _) in SITUATIONS.items()])
+    report.say("*yes*: all of what must hold; *rises*: all of it, where the energy may rise; *refused*: by its name.")
+    report.table(matrix(found))
+    report.say("### Each case")
+    report.table(rows)
+    report.say("### Notes on models", notes(cases))
+
+
+def measured(cases: list[Case], runs: Runs) -> tuple[list[tuple[Case, Outcome]], list[float | None]]:
     """Each case, and its rise of energy with a tenth of the time step where the energy may rise."""
-    results: list[tuple[Case, Outcome]] = []
-    rises: list[float | None] = []
-    with tempfile.TemporaryDirectory() as folder, np.errstate(all="ignore"):
-        for case in cases:
-            results.append((case, run_case(case, Path(folder))))
-            rising = case.energy > 1e-6 and not case.fails
-            rises.append(run_case(finer(case), Path(folder)).rise if rising else None)
-            print(f"{case.name}: {'; '.join(broken(*results[-1])) or 'holds'}", flush=True)
-    return results, rises
+    found = dict(runs.of_cases(cases, finer_too=lambda case: case.energy > 1e-6 and not case.fails))
+    results = [(case, found[index, False]) for index, case in enumerate(cases)]
+    return results, [found[index, True].rise if (index, True) in found else None for index in range(len(cases))]
 
 
 if __name__ == "__main__":
