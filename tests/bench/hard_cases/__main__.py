@@ -5,6 +5,7 @@ On a GPU all precisions by one call: --device gpu --precision float64 --precisio
 """
 
 from collections import Counter
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -116,7 +117,7 @@ def model_row(case: Case, out: Outcome, finer_rise: float | None) -> dict[str, A
     return {name: found[name] for name in COLUMNS}
 
 
-def notes(cases: list[Case]) -> str:
+def notes(cases: Sequence[Case | EffectCase]) -> str:
     """Each note once, with the cases that it is about."""
     about: dict[str, list[str]] = {}
     for case in cases:
@@ -201,6 +202,7 @@ def effects(report: Report, runs: Runs, quick: bool) -> None:
         rows += [effect_row(case, of_case)] if of_case else []
     report.say(EFFECTS_ABOUT.format(seeds=seeds))
     report.table(rows)
+    report.say(notes(cases))
     report.data["effects"] = rows
 
 
