@@ -201,7 +201,7 @@ def test_every_text_of_the_package_compiles_without_warnings(path, tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("arch", ["sm_80", "sm_90"])
+@pytest.mark.parametrize("arch", [pytest.param("sm_80", marks=pytest.mark.long), "sm_90"])
 @pytest.mark.parametrize("path", GPU_TEXTS)
 def test_every_text_of_the_package_compiles_for_gpus(path, arch, tmp_path):
     """By NVRTC, which needs no GPU and no driver; what it says counts as a failure too.
