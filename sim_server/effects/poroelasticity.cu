@@ -11,16 +11,16 @@ struct PoreHistory {
     const real* free;        // (nodes,) 1, or 0 at fixed nodes and in a frozen body
     const int* watched;      // (n,) a node of the element's body that is free unless the body is frozen
     const real* coupling;    // (n,) alpha M [Pa]
-    real* reached;           // (1, n) in, out: J at the end of the step before, of this one
+    real* jacobian;          // (1, n) in, out: J at the end of the step before, of this one
     real* inner;             // (1, n) in, out: pressure as the last step began, as it ended [Pa]
 };
 
 // Once a step.
 KERNEL(advance, PoreHistory) {
     index tet[4];
-    const number before = at_items(p.reached, i), J = (number)element_at(p, i, tet).J, now = is_live(p, i) ? J : before;
+    const number before = at_items(p.jacobian, i), J = (number)element_at(p, i, tet).J, now = is_live(p, i) ? J : before;
     put(p.inner, i, at_items(p.inner, i) + at_items(p.coupling, i) * (before - now));
-    put(p.reached, i, now);
+    put(p.jacobian, i, now);
 }
 
 // Mean of a nodal field in an element.
@@ -66,7 +66,7 @@ KERNEL(spread, PoreSpread) {
 
 // Pressure of an element at J, before the fluid flows [Pa].
 template <class P> INLINE local_number pressure_of(const P& p, index i, local_number J) {
-    return (local_number)(at_items(p.inner, i) + at_items(p.coupling, i) * (at_items(p.reached, i) - (number)J));
+    return (local_number)(at_items(p.inner, i) + at_items(p.coupling, i) * (at_items(p.jacobian, i) - (number)J));
 }
 
 struct PoreElements {
@@ -81,7 +81,7 @@ struct PoreElements {
     const local* stiffness;  // (n,) alpha^2 M [Pa]
     local h;                 // factor of the force [s]
     local tangent;           // factor of the tangent [s2]
-    const real* reached;     // (1, n) J as the step began
+    const real* jacobian;    // (1, n) J as the step began
     const real* inner;       // (1, n) pressure there [Pa]
     local* corners;          // (4, n, 9) out: h f_a - tangent (K v)_a [N s], upper triangle of tangent K_aa [kg]
     local* edges;            // (6, n, 9) out: tangent K_ab, a < b [kg]
@@ -112,7 +112,7 @@ struct PoreEnergy {
     const local* volume;     // (n,) [m3]
     const real* coupling;    // (n,) alpha M [Pa]
     const real* storage;     // (n,) M [Pa]
-    const real* reached;     // (1, n) J as the step began
+    const real* jacobian;    // (1, n) J as the step began
     const real* inner;       // (1, n) pressure there [Pa]
     local* energy;           // (n,) out [J]
 };

@@ -68,15 +68,15 @@ class Params(ParamsWithHistory):
 
 
 class Poroelasticity(TetrahedraWithHistory):
-    """memory: reached (1, m), J at the end of the last step; inner (1, m), the pressure there after the flow [Pa].
+    """memory: jacobian (1, m), J at the end of the last step; inner (1, m), the pressure there after the flow [Pa].
 
     pressure (n,): at nodes of the scene, at the end of the last step [Pa]. stages: of the flow in a step.
     """
 
     def __init__(self, world: World, listed: list[tuple[Body, Any]]):
         super().__init__(world, listed)
-        self.remember(reached=1, inner=1)
-        self.memory["reached"][...] = 1
+        self.remember(jacobian=1, inner=1)
+        self.memory["jacobian"][...] = 1
         self.biot, self.storage, self.mobility = (
             self._of_elements([getattr(params, key) for _, params in listed]) for key in ("biot", "storage", "mobility")
         )

@@ -119,6 +119,7 @@ class Bodies:
             np.zeros(1, "u4"),
         )
         self.clock, self.stamps, self.counters = np.zeros(1), np.zeros((2, 2), "i8"), np.zeros(5, "u4")
+        self.begun = np.zeros(1, "i8")
         self.solves = np.zeros((2, count), PCG_RESULT)
 
     def params(self, b: NDArray, attempt: int = ITERATE) -> Any:
@@ -130,6 +131,7 @@ class Bodies:
         for name, array in {
             "clock": self.clock, "step": self.step, "pool_counters": self.counters, "finished_blocks": self.finished,
             "timestamps": self.stamps, "results": self.solves, "host_results": self.solves, "moving": self.moving,
+            "begun": self.begun,
         }.items():  # fmt: skip
             end[name] = array.ctypes.data
         end["counters"], end["capacity"], end["bodies"] = 5, 2, len(self.phase)

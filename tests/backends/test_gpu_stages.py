@@ -58,6 +58,7 @@ class Bodies:
         self.moving, self.left, self.finished = np.ones(count, np.int32), np.zeros(1, np.int32), np.zeros(1, "u4")
         self.results, self.step, self.clock = np.zeros((16, count), STAGE_RESULT), np.full(1, 9, "i8"), np.zeros(1)
         self.stamps, self.counters = np.zeros((16, 2), "i8"), np.full(5, 3, "u4")
+        self.begun = np.zeros(1, "i8")
         self.solves, self.told = np.ones((16, count), PCG_RESULT), np.zeros((16, count), PCG_RESULT)
         self.params = np.zeros((), STAGE_DECISION)
         for name in ("state", "phase", "largest", "bound", "rows", "estimate", "body", "results", "left"):
@@ -66,6 +67,7 @@ class Bodies:
         for name, array in {
             "clock": self.clock, "step": self.step, "pool_counters": self.counters, "finished_blocks": self.finished,
             "timestamps": self.stamps, "results": self.solves, "host_results": self.told, "moving": self.moving,
+            "begun": self.begun,
         }.items():  # fmt: skip
             end[name] = array.ctypes.data
         end["dt"], end["counters"], end["capacity"], end["bodies"] = 0.5, 5, 16, count
@@ -82,7 +84,12 @@ class Bodies:
         if self.step[0] == 9:
             assert not self.stamps.any() and (self.counters == 3).all()
             return False
-        assert self.step[0] == 10 and self.clock[0] == 5.0 and self.stamps[9, 1] == self.stamps[10, 0] == 77
+        assert (
+            self.step[0] == 10
+            and self.clock[0] == 5.0
+           
+        assert self.stamps[9, 1] == self.stamps[10, 0] == self.begun[0] == 77
+        )
         assert not self.counters.any() and not self.moving.any() and (self.phase == OPEN).all() and self.left[0] == 0
         assert (self.told[9] == self.solves[9]).all() and (self.state["form"] == ITERATE).all()
         return True

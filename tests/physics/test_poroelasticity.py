@@ -55,8 +55,8 @@ def test_the_fluid_of_a_sealed_body_stays_and_takes_no_momentum() -> None:
 
 def stored(fluid: Poroelasticity) -> float:
     """Returns the volume of fluid beyond that at rest [m3], at the J of which the pressures are."""
-    reached, inner = fluid.memory["reached"][0], fluid.memory["inner"][0]
-    return float(fluid.volume @ (inner / fluid.storage + fluid.biot * (reached - 1)))
+    jacobian, inner = fluid.memory["jacobian"][0], fluid.memory["inner"][0]
+    return float(fluid.volume @ (inner / fluid.storage + fluid.biot * (jacobian - 1)))
 
 
 def test_forces_are_the_slope_of_the_energy() -> None:
