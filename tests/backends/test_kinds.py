@@ -15,4 +15,5 @@ def test_a_status_is_the_same_number_in_records_and_messages():
 
 
 def test_every_answer_to_a_runaway_has_a_number_of_its_own():
-    assert len(set(CODES.values())) == len(CODES) == 3
+    told = {name: number for name, number in CODES.items() if name != "halve"}
+    assert len(set(told.values())) == len(told) == 3 and CODES["halve"] == CODES["freeze"]

@@ -50,6 +50,7 @@ OTHERS = {
     "membrane",
     "muscle",
     "plasticity",
+    "poroelasticity",
     "prony",
     "rayleigh",
     "rod",
