@@ -106,11 +106,12 @@ def test_commands_of_the_client() -> None:
 
 
 def _examples() -> list[tuple[str, str]]:
-    """(document, command line) of all code blocks, without comments."""
+    """(document, command line) of all code blocks, without comments; of lines joined by && each."""
     lines = []
     for path in texts():
         for block in re.findall(r"^```(?:sh)?\n(.*?)^```", path.read_text(), re.MULTILINE | re.DOTALL):
-            lines += [(path.name, line.split(" #")[0].strip()) for line in block.splitlines()]
+            said = [line.split(" #")[0] for line in block.splitlines()]
+            lines += [(path.name, part.strip()) for line in said for part in line.split(" && ")]
     return [(name, line) for name, line in lines if line.startswith(("sim-server ", "sim-client ", "precond-worker "))]
 
 
