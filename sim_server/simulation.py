@@ -157,7 +157,8 @@ class Simulation:
             with self.world.made_with(dt, dt, usual_tangent=False):
                 assemble.append([mailed.get(x.name, x) for x in self.launches(detect=False, euler=True)[0]])
                 advance.append(self.system.advance(self.integrator.before))
-        return halving(self.integrator, assemble, advance, effects)
+        touched = self.touch.only if self.touch else None
+        return halving(self.integrator, assemble, advance, effects, self.energies.touch.values(), touched)
 
     def _rank_one(self) -> RankOne | None:
         """Returns the parts of A beside its blocks; one effect at most has some."""

@@ -20,7 +20,8 @@ class Halving:
     before: (n, 3) x at the start of the last step [m]
     rotation: (n, 3, 3) frames of nodes
     scheme: (n, 3) predictor, damping_velocity and inertial_increment [m/s]; empty in backward Euler
-    left: arrays (n, 3) that a step leaves, x and v the first of them
+    left: arrays (n, 3) and (n,) that a step leaves, x and v the first of them
+    touched: (1,) gets the index of the body whose step is made, else it is -1
     """
 
     assemble: Sequence[Sequence[Launch]]
@@ -32,6 +33,7 @@ class Halving:
     rotation: Float64
     scheme: Sequence[Float64]
     left: Sequence[Float64]
+    touched: Int32
 
     @property
     def launches(self) -> list[Launch]:

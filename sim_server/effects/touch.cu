@@ -25,6 +25,7 @@ struct Apply {
     const real* coefficients;  // (2,) h, world.force_coefficient, and dx_dv, world.dx_dv: both dt in backward Euler [s]
     own<real> diagonal;      // (nodes, 1) in, out: += h dx_dv k [kg]
     own<real> b;             // (nodes, 3) in, out: += h f - h dx_dv k predictor [N s]
+    const int* only;         // (1,) the body whose nodes alone are touched; -1: all
     int interactions;
     const int* whose;        // (interactions, 2) id of each, body that it acts on
     const int* held_start;   // (interactions + 1,) into `held`
@@ -40,6 +41,7 @@ struct Apply {
 // step, estimated with the node's own block of A as inertia; by the force at the start a stiff spring would throw the node from one
 // side of its target to the other without end.
 MAILED_KERNEL(apply, Apply) {
+    if (p.only[0] >= 0 && p.whose[2 * p.entry[p.first[i]] + 1] != p.only[0]) return;
     int node = p.node[i];
     vec3 x = load3(p.x, node), predictor = load3(p.predictor, node), b = load3(p.b, node);
     real diagonal = row_at<1>(p.diagonal, node, 0);

@@ -93,6 +93,7 @@ class Touch(Effect):
 
     last_id: of the interactions so far
     force (n, 3) [N], spring (n,) [N/m], anchor (n, 3) [m]: what they exert on each node in a step.
+    only (1,): index of the body that alone is touched while its step is made again by short ones; -1: all are
     """
 
     def __init__(self, world: World, listed: list[tuple[Body, Any]]):
@@ -112,7 +113,8 @@ class Touch(Effect):
         self.last_id = 0
         self._points: dict[str, NamedPoints] = {}
         self.force, self.spring, self.anchor = np.zeros_like(world.x), np.zeros(world.nodes), np.zeros_like(world.x)
-        world.backend.keep(self.force, self.spring, self.anchor)
+        self.only: Int32 = np.full(1, -1, np.int32)
+        world.backend.keep(self.force, self.spring, self.anchor, self.only)
 
     def cuttable(self, body: Body) -> bool:
         return True
@@ -362,7 +364,7 @@ class Touch(Effect):
             pull=np.zeros((len(self._same[1]["held"]), 4)),
             clock=system.clock, x=w.x, predictor=w.predictor, free=w.free, block=system.block, dt=w.dt,
             coefficients=w.coefficients, diagonal=system.diagonal, b=system.b, force=self.force,
-            spring=self.spring, anchor=self.anchor,
+            spring=self.spring, anchor=self.anchor, only=self.only,
         )  # fmt: skip
         self._applied = self._begun = interactions
         return self._launch

@@ -8,6 +8,7 @@ from sim_server.arrays import Float64, Int32, Int64
 from sim_server.mesh.surface import EDGES, FACES
 
 Bools = NDArray[np.bool_]
+ROUNDING = 1e-9  # of coordinates, by which a corner may seem to be on the wrong side of a plane
 
 
 def met_by_blade(x: Float64, tets: Int32, corners: Float64) -> Int64:
@@ -21,7 +22,8 @@ def met_by_blade(x: Float64, tets: Int32, corners: Float64) -> Int64:
     triangles = [corners[[0, 1, 2]], *([corners[[0, 2, 3]]] if len(corners) == 4 else [])]
     met = np.zeros(len(near), bool)
     for triangle in triangles:
-        met |= _meet(points[near], triangle)
+        across = np.flatnonzero(_across(points[near], triangle))
+        met[across] |= _meet(points[near[across]], triangle)
     return near[met]
 
 
@@ -49,6 +51,14 @@ def torn(x: Float64, tets: Int32, gradients: Float64, present: Bools, limit: flo
             taken[tets[element]] = True
             found.append(element)
     return np.array(sorted(found), np.int64)
+
+
+def _across(points: Float64, triangle: Float64) -> Bools:
+    """Returns whether tetrahedra (m, 4, 3) have corners on both sides of a triangle's plane, or nearly on it."""
+    normal = np.cross(triangle[1] - triangle[0], triangle[2] - triangle[0])
+    away = (points - triangle[0]) @ normal
+    nearly = ROUNDING * np.linalg.norm(normal) * max(np.abs(points).max(initial=0), np.abs(triangle).max())
+    return np.asarray((away.min(axis=1) <= nearly) & (away.max(axis=1) >= -nearly))
 
 
 def _meet(points: Float64, triangle: Float64) -> Bools:

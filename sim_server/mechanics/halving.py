@@ -7,6 +7,9 @@ energy that should not be there. Loads, pushes and grabs are as at the start of 
 
 from collections.abc import Iterable, Sequence
 
+import numpy as np
+
+from sim_server.arrays import Float64, Int32
 from sim_server.backends.base import Launch
 from sim_server.backends.halving import Halving
 from sim_server.errors import InputError
@@ -23,9 +26,13 @@ def time_steps(world: World) -> list[float]:
 
 def halving(
     integrator: Integrator, assemble: Sequence[Sequence[Launch]], advance: Sequence[Launch],
-    effects: Sequence[CouplesNodes],
+    effects: Sequence[CouplesNodes], exerted: Iterable[Float64], touched: Int32 | None,
 ) -> Halving:  # fmt: skip
-    """Returns the input of an engine. assemble, advance: launches of each time step."""
+    """Returns the input of an engine.
+
+    assemble, advance: launches of each time step. exerted: arrays (nodes, 3) and (nodes,) of what acts on nodes from
+    outside, which the energy balance reads. touched: `only` of pushes and grabs
+    """
     w, s = integrator.world, integrator.system
     scheme = [] if w.plain else [w.predictor, w.damping_velocity, integrator.inertial_increment]
     end = None if w.plain else integrator.advance_euler()
@@ -33,7 +40,8 @@ def halving(
     return Halving(
         assemble=assemble, advance=advance, end=end, parts=integrator.parts_of(listed, effects),
         coefficients=w.coefficients, before=integrator.before, rotation=s.rotation, scheme=scheme,
-        left=[w.x, w.v, s.dv, integrator.before, *scheme],
+        left=[w.x, w.v, s.dv, integrator.before, *scheme, *exerted],
+        touched=np.full(1, -1, np.int32) if touched is None else touched,
     )  # fmt: skip
 
 

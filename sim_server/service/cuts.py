@@ -101,8 +101,8 @@ class CutTelemetry:
             b.name: deque([(-1, 0)], maxlen=KEPT) for b in self._bodies.values()
         }  # steps before the first with it, and number, of cuts
         self._unwritten: dict[str, deque[tuple[pb.Topology, float]]] = {
-            b.name: deque(maxlen=KEPT) for b in self._bodies.values()
-        }  # what the log had no room for, and from when it holds [s]
+            b.name: deque(maxlen=1) for b in self._bodies.values()
+        }  # the newest that the log had no room for, and from when it holds [s]; no frame of earlier ones is written
         self._skins: dict[str, Int64] = {}  # element of each vertex
         self.removed: dict[str, int] = {}  # elements, by object
         if self._bodies:

@@ -87,8 +87,7 @@ class Bodies:
         assert (
             self.step[0] == 10
             and self.clock[0] == 5.0
-           
-        assert self.stamps[9, 1] == self.stamps[10, 0] == self.begun[0] == 77
+            and self.stamps[9, 1] == self.stamps[10, 0] == self.begun[0] == 77
         )
         assert not self.counters.any() and not self.moving.any() and (self.phase == OPEN).all() and self.left[0] == 0
         assert (self.told[9] == self.solves[9]).all() and (self.state["form"] == ITERATE).all()

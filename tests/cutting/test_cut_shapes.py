@@ -43,6 +43,14 @@ def test_a_blade_takes_what_its_surface_meets(seed, corners):
     assert len(found) or seed == 5
 
 
+def test_a_blade_in_the_plane_of_faces_takes_what_it_touches():
+    """Those on both sides, as an element that only touches the surface counts."""
+    blade = np.array([[0.5, -1, -1], [0.5, 3, -1], [0.5, -1, 3]])
+    found = met_by_blade(MESH.rest, MESH.tets, blade)
+    x = MESH.rest[MESH.tets][:, :, 0]
+    assert np.array_equal(found, np.flatnonzero((x.min(axis=1) <= 0.5) & (x.max(axis=1) >= 0.5)))
+
+
 def test_a_sphere_takes_elements_by_their_centroids():
     found = in_sphere(MESH.rest, MESH.tets, np.array([0.5, 0.4, 0.35]), 0.3)
     away = np.linalg.norm(MESH.centroids - [0.5, 0.4, 0.35], axis=1)

@@ -72,6 +72,37 @@ def test_neighbours_are_not_disturbed(threads):
         assert both.world.v[a].tobytes() == alone.world.v[b].tobytes()
 
 
+def test_a_hand_on_a_neighbour_feels_and_does_the_same():
+    calm = bar(name="calm", young=2e4, fixed="X < 0.01", touch={"max_force": 1e5})
+    felt = []
+    for others, wild_ones in (((wild(),), ("wild",)), ((), ())):
+        sim = released(calm, *others, names=wild_ones, gravity=(0, -9.81, 0), on_runaway="halve")
+        sim.touch.grab("anna", "calm", (2.0, 0.5, 0.5), 0.3, (2.3, 0.8, 0.5), 2e3, 150.0, 1e3)
+        sim.engine.run(10)
+        records = sim.engine.records()
+        assert not others or records["halvings"].any()
+        felt.append((records["work"][:: 1 + len(others)].tolist(), sim.engine.other_reactions()["force"].tolist()))
+    assert felt[0] == felt[1]
+
+
+def test_short_steps_that_do_not_help_leave_no_work_behind():
+    """The budget is set so low that no short step is good enough; the step is then as the scheme made it."""
+    column = bar((4, 2, 2), (2, 0.5, 0.5), young=2e4, fixed="X < 0.01", touch={"max_force": 1e5})
+    ends = []
+    for choice in ("freeze", "halve"):
+        sim = simulation(column, gravity=(0, -9.81, 0), preconditioner="block_jacobi", on_runaway=choice)
+        sim.touch.grab("anna", "bar", (2.0, 0.5, 0.5), 0.3, (2.3, 0.8, 0.5), 2e3, 150.0, 1e3)
+        sim.engine.run(6)
+        sim.engine.records()
+        balance = sim.energies.balance
+        balance["start"] -= float(balance["budget"][0]) + 10 * float(balance["gross"][0])
+        sim.engine.run(1)
+        (record,) = sim.engine.records()
+        assert record["halvings"] == 0
+        ends.append((float(record["work"]), int(record["iterations"])))
+    assert ends[0][0] == ends[1][0] and ends[1][1] > ends[0][1]
+
+
 @pytest.mark.parametrize("integrator", ONE_STEP.values(), ids=ONE_STEP)
 def test_what_does_not_run_away_is_the_same_to_the_bit(integrator):
     ends = []

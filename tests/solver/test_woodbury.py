@@ -275,7 +275,7 @@ def test_a_gpu_leaves_it_out():
     default = touched()[0].scene.solver
     assert default.woodbury > 0
     default.check_device("gpu")
-    for option, value in (("preconditioner", "ssor"), ("factor_precision", "float64"), ("budget", 1.0)):
+    for option, value in (("preconditioner", "ssor"), ("factor_precision", "float64")):
         with pytest.raises(InputError, match=f"solver.{option}"):
             default.model_copy(update={option: value}).check_device("gpu")
 

@@ -25,13 +25,14 @@ class NativeHalving:
             "start_x": np.zeros((nodes, 3)), "start_v": np.zeros((nodes, 3)),
             "room": np.zeros((len(given.left), nodes, 3)),
         }  # fmt: skip
+        self._width = np.array([array.size // nodes for array in given.left], np.int32)
         self._array = (c.c_void_p * len(given.left))(*(array.ctypes.data for array in given.left))
         self.native = structs.Halving(
             levels=len(given.assemble), launches=self._launch.shape[1], launch=self._launch.ctypes.data,
             advance=self._advance.ctypes.data, end=-1 if given.end is None else number[id(given.end)],
             own_coefficients=tuple(given.coefficients.tolist()), array=c.addressof(self._array),
-            arrays=len(given.left), state=c.addressof(self._state), made=self._made.ctypes.data,
-            result=c.addressof(self._result),
+            arrays=len(given.left), width=self._width.ctypes.data, touched=given.touched.ctypes.data,
+            state=c.addressof(self._state), made=self._made.ctypes.data, result=c.addressof(self._result),
         )  # fmt: skip
         arrays = self._own | {name: getattr(given, name) for name in ("coefficients", "before", "rotation")}
         arrays |= dict(zip(("predictor", "damping_velocity", "inertial_increment"), given.scheme, strict=False))

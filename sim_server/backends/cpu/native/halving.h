@@ -24,9 +24,9 @@ static void remember_start(const Loop& loop) {
     std::memcpy(h.start_v, loop.v, sizeof(double) * 3 * (int64_t)loop.nodes);
 }
 
-static void copy_nodes(const Body& body, double* to, const double* from) {
-    const int64_t at = 3 * (int64_t)body.first;
-    std::memcpy(to + at, from + at, sizeof(double) * 3 * (body.last - body.first));
+static void copy_nodes(const Body& body, double* to, const double* from, int width = 3) {
+    const int64_t at = width * (int64_t)body.first;
+    std::memcpy(to + at, from + at, sizeof(double) * width * (body.last - body.first));
 }
 
 // Elastic energy of a body as it is now [J]; NaN beyond what its law defines.
@@ -54,7 +54,7 @@ static bool ran_away(const Loop& loop, int index, bool elastic, bool whole) {
     return !(b.kinetic + elastic_of(loop, index) <= most);
 }
 
-// Adds the solve of a short step: the worst status, all iterations.
+// Adds the solve of a short step: the last status other than converged, the largest residual, all iterations.
 static void add_solve(SolveResult& sum, const SolveResult& r) {
     sum.iterations += r.iterations;
     sum.seconds += r.seconds;
@@ -132,14 +132,17 @@ static int make_again(Loop& loop, int index, int first, bool elastic) {
     const Halving& h = *loop.halving;
     const Body& body = loop.body[index];
     const int64_t room = 3 * (int64_t)loop.nodes;
-    for (int k = 0; k < h.arrays; ++k) copy_nodes(body, h.room + k * room, h.array[k]);
+    for (int k = 0; k < h.arrays; ++k) copy_nodes(body, h.room + k * room, h.array[k], h.width[k]);
+    h.touched[0] = index;
     h.result[index] = SolveResult{0, 0, 0, CONVERGED, body.now.kind, 0, 0, 0};
     for (int level = first; level <= h.levels; ++level)
         if (make_short_steps(loop, index, level) && !ran_away(loop, index, elastic, false)) {
             begin_next(loop, index);
+            h.touched[0] = -1;
             return level;
         }
-    for (int k = 0; k < h.arrays; ++k) copy_nodes(body, h.array[k], h.room + k * room);
+    h.touched[0] = -1;
+    for (int k = 0; k < h.arrays; ++k) copy_nodes(body, h.array[k], h.room + k * room, h.width[k]);
     return 0;
 }
 
@@ -148,7 +151,8 @@ static void halve_steps(Loop& loop) {
     const Halving& h = *loop.halving;
     for (int i = 0; i < loop.bodies; ++i) {
         ShortSteps& s = h.state[i];
-        h.made[i] = 0;
+        h.made[i] = h.result[i].iterations = h.result[i].fallbacks = 0;
+        h.result[i].seconds = 0;
         if (loop.energies->balance[i].phase == FROZEN) continue;
         const bool goes_on = s.left > 0, elastic = s.left >= 0;
         if (!elastic) ++s.left;
@@ -169,12 +173,12 @@ static void halve_steps(Loop& loop) {
 }
 
 static void note_halving(const Halving& h, int index, Record& record) {
-    record.halvings = h.made[index];
-    if (!record.halvings) return;
     const SolveResult& r = h.result[index];
-    record.iterations += r.iterations;
+    record.halvings = h.made[index];
+    record.iterations += r.iterations;  // also of short steps that did not help
     record.fallbacks += r.fallbacks;
     record.solve += r.seconds;
+    if (!record.halvings) return;
     record.status = r.status;
     record.residual = r.residual;
     record.kind = r.kind;

@@ -175,8 +175,10 @@ struct Halving {                       // halving.h
     double* before;                    // (nodes, 3) gets x when the step begins
     double *predictor, *damping_velocity, *inertial_increment;  // (nodes, 3), or null: the scheme is backward Euler
     const double* rotation;            // (nodes, 3, 3)
-    double** array;                    // (arrays,) (nodes, 3) that a step leaves
+    double** array;                    // (arrays,) (nodes, width) that a step leaves
+    const int32_t* width;              // (arrays,) 3 or 1
     int32_t arrays;
+    int32_t* touched;                  // (1,) body that alone pushes and grabs act on; -1: all
     double* room;                      // (arrays, nodes, 3)
     ShortSteps* state;                 // (bodies,)
     int32_t* made;                     // (bodies,) halvings of the step
