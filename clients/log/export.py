@@ -73,7 +73,7 @@ def write_npz(
         _add(archive, "time", times)
         _add(archive, "step", np.array([log.object_log(name).frames[index][0] for index, _ in chosen], np.int64))
         _add(archive, "tets", mesh.tets if mesh else np.empty((0, 4), np.int32))
-        if mesh and any(log.mesh(name, e).uncut for e in {e for _, e in chosen}):
+        if mesh and any(log.uncut(name, e) != e for e in {e for _, e in chosen}):
             _add(archive, "removed_step", _removed_steps(log, name, mesh, chosen))
         for scalar, values in log.scalars(name).items():
             _add(archive, f"scalars/{scalar}", values)
@@ -92,7 +92,7 @@ def _frames_of_epoch(log: Log, name: str, epoch: int | None) -> list[tuple[int, 
     """Returns (frame number, epoch) of the frames to export, all of one mesh, whatever was cut from it."""
     epochs = log.object_log(name).epochs
     found = sorted(set(epochs))
-    if epoch is None and len({_uncut(log.mesh(name, e)).epoch for e in found}) > 1:
+    if epoch is None and len({log.uncut(name, e) for e in found}) > 1:
         raise BadInput(
             f"{log.path}: {name!r} changed its mesh; choose one with --epoch, of {', '.join(map(str, found))}"
         )

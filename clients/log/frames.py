@@ -83,6 +83,10 @@ def _cut(uncut: Mesh, message: pb.Topology, name: str) -> Mesh:
     """Returns a mesh without the elements that were removed, and with the surface that is left."""
     removed = array(message.removed, np.int32, (-1,), f"{name}: removed")
     triangles = array(message.triangles, np.int32, (-1, 3), f"{name}: triangles")
+    if message.nodes != len(uncut.rest):
+        raise Refused(
+            f"{name}: nodes is {message.nodes}; allowed: {len(uncut.rest)}, of the mesh that was cut", "shape"
+        )
     check_range(removed, 0, len(uncut.tets), f"{name}: removed")
     check_range(triangles, 0, len(uncut.rest), f"{name}: triangles")
     there = np.ones(len(uncut.tets), bool)
@@ -92,10 +96,9 @@ def _cut(uncut: Mesh, message: pb.Topology, name: str) -> Mesh:
         corners = array(message.skin_triangles, np.int32, (-1, 3), f"{name}: skin_triangles")
         check_range(corners, 0, len(skin.nodes), f"{name}: skin_triangles")
         skin = _with_faces(replace(skin, triangles=corners), _bare(uncut.tets[removed], triangles))
-    elastic = there if len(uncut.young) else slice(0)
     return replace(
         uncut, epoch=message.header.epoch + message.cut, tets=uncut.tets[there], triangles=triangles, skin=skin,
-        uncut=uncut, young=uncut.young[elastic], poisson=uncut.poisson[elastic],
+        uncut=uncut, young=uncut.young[there[: len(uncut.young)]], poisson=uncut.poisson[there[: len(uncut.poisson)]],
     )  # fmt: skip
 
 

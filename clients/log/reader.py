@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
 """A recorded run: scene, meshes, frames, per-step scalars, interactions, obstacles.
 
-A log that was cut off or damaged is read as far as it goes; `notes` says what is missing. Frames stay on disk and are
-decoded when asked for, so a log may be larger than memory.
+A log that was cut off or damaged is read as far as it goes; `notes` says what is missing. Frames and meshes stay on
+disk and are decoded when asked for, so a log may be larger than memory.
 """
 
 from __future__ import annotations
@@ -15,9 +15,10 @@ from google.protobuf.message import DecodeError
 
 from clients.errors import BadInput
 from clients.log.bad_log import bad_log_is_bad_input
-from clients.log.frames import Frame, Mesh, frame_of, mesh_of
+from clients.log.frames import Frame, Mesh, frame_of
+from clients.log.meshes import Meshes
 from clients.log.obstacles import Obstacle, ObstacleFrame, obstacle_frame_of, obstacle_of
-from clients.log.scalars import Columns, columns, row
+from clients.log.scalars import Columns, Rows, columns
 from protocol import messages_pb2 as pb
 from protocol.log_file import LogFile, LogMessage
 from protocol.refused import Refused
@@ -28,9 +29,9 @@ class ObjectLog:
     """The records of one object."""
 
     name: str
-    meshes: dict[int, Mesh] = field(default_factory=dict)  # by epoch
+    meshes: Meshes  # by epoch
     frames: list[tuple[int, int, int, int]] = field(default_factory=list)  # (step, epoch, offset, number)
-    rows: list[tuple] = field(default_factory=list)
+    rows: Rows = field(default_factory=Rows)
     interactions: list[tuple[float, pb.Interaction]] = field(default_factory=list)  # (time [s], push or grab)
 
     @property
@@ -81,6 +82,8 @@ class Log:
             notes.append(
                 f"{self.path}: {len(self._malformed)} malformed messages left out, first: {self._malformed[0]}"
             )
+        notes += [f"{self.path}: object {name!r}: {note}" for name, found in self.objects.items()
+                  for note in found.rows.notes()]  # fmt: skip
         return notes
 
     def object_log(self, name: str) -> ObjectLog:
@@ -92,10 +95,11 @@ class Log:
 
     def mesh(self, name: str, epoch: int) -> Mesh:
         """Returns the mesh of an object in an epoch. Raises BadInput if it is not in the log."""
-        meshes = self.object_log(name).meshes
-        if epoch not in meshes:
-            raise BadInput(f"{self.path}: the mesh of object {name!r}, epoch {epoch}, is not in the log")
-        return meshes[epoch]
+        return self._meshes(name, epoch)[epoch]
+
+    def uncut(self, name: str, epoch: int) -> int:
+        """Returns the epoch of the mesh of which that of an epoch is a part, or is. Raises BadInput as `mesh`."""
+        return self._meshes(name, epoch).uncut(epoch)
 
     def scalars(self, name: str) -> Columns:
         """Returns the scalars per step, ascending in step: arrays (k,) by the names in scalars.py."""
@@ -107,11 +111,9 @@ class Log:
         if not -len(frames) <= index < len(frames):
             raise BadInput(f"{self.path}: no frame {index} of object {name!r}; {len(frames)} frames were recorded")
         frame = frame_of(pb.State.FromString(self._file.data(*frames[index][2:])))
-        mesh = self.object_log(name).meshes.get(frame.epoch)
-        if mesh is not None and len(mesh.rest) != len(frame.x):
-            raise BadInput(
-                f"{self.path}: step {frame.step} of {name!r} has {len(frame.x)} nodes, its mesh has {len(mesh.rest)}"
-            )
+        nodes = self.object_log(name).meshes.nodes(frame.epoch)
+        if nodes not in (None, len(frame.x)):
+            raise BadInput(f"{self.path}: step {frame.step} of {name!r} has {len(frame.x)} nodes, its mesh has {nodes}")
         return frame
 
     def frames(self, name: str) -> Iterator[Frame]:
@@ -126,6 +128,12 @@ class Log:
 
     def __exit__(self, *_: object) -> None:
         self.close()
+
+    def _meshes(self, name: str, epoch: int) -> Meshes:
+        meshes = self.object_log(name).meshes
+        if epoch not in meshes:
+            raise BadInput(f"{self.path}: the mesh of object {name!r}, epoch {epoch}, is not in the log")
+        return meshes
 
     def _keep(self, message: LogMessage) -> None:
         try:
@@ -147,16 +155,16 @@ class Log:
             return
         if message.kind not in ("topology", "state", "step", "interaction", "factor") or not message.object:
             raise Refused("a message of an unknown channel")
-        found = self.objects.setdefault(message.object, ObjectLog(message.object))
+        if message.object not in self.objects:
+            self.objects[message.object] = ObjectLog(message.object, Meshes(self._file.data))
+        found = self.objects[message.object]
         if message.kind == "topology":
-            topology = pb.Topology.FromString(message.data)
-            mesh = mesh_of(topology, found.meshes.get(topology.header.epoch))
-            found.meshes[mesh.epoch] = mesh
+            found.meshes.add(pb.Topology.FromString(message.data), message.offset, message.number)
         elif message.kind == "state":
             frame = frame_of(pb.State.FromString(message.data))
             found.frames.append((frame.step, frame.epoch, message.offset, message.number))
         elif message.kind == "step":
-            found.rows.append(row(pb.ObjectStep.FromString(message.data)))
+            found.rows.take(pb.ObjectStep.FromString(message.data))
         elif message.kind == "interaction":
             found.interactions.append((message.time / 1e9, pb.Interaction.FromString(message.data)))
 

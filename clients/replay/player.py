@@ -6,12 +6,13 @@ from __future__ import annotations
 import math
 import os
 import time
-from collections import deque
+from collections import Counter, deque
 
 import numpy as np
 import zenoh
 
 from clients.errors import BadInput
+from clients.log.scalars import ENUMS
 from clients.replay.replay_server import ReplayServer
 from clients.replay.timeline import Timeline
 from protocol import messages_pb2 as pb
@@ -19,6 +20,7 @@ from protocol import messages_pb2 as pb
 STEPS_PERIOD, STATE_PERIOD, STATUS_PERIOD = 0.05, 1 / 30, 1.0  # s, as of a server
 POLL = 0.02  # s between two readings of the commands
 WINDOW = 1000  # steps of means and percentiles
+COUNTED = ("fallbacks", "halvings")  # fields above 0 in a step that the status counts, beside those not converged
 
 
 class Player:
@@ -47,6 +49,8 @@ class Player:
         self._status = pb.Status(scene=timeline.scene.name, dt=timeline.scene.dt, pid=os.getpid())
         self._status.device = f"replay of {timeline.path.name}"
         self._objects = {name: self._status.objects.add(object=name) for name in timeline.scene.objects}
+        self._whole: dict[str, pb.Topology] = {}  # the last one of each object that has all elements
+        self._events: dict[str, Counter[str]] = {name: Counter() for name in self._objects}
         self._iterations: dict[str, deque[int]] = {name: deque(maxlen=WINDOW) for name in self._objects}
         self._seconds: deque[float] = deque(maxlen=WINDOW)
         server.offer("scene", timeline.scene)
@@ -67,6 +71,9 @@ class Player:
 
     def _once(self) -> None:
         self._time, self._at = self.begin, time.monotonic()
+        for name, found in self._objects.items():  # counts begin anew
+            found.clipped = 0
+            self._events[name].clear()
         for when, name, message in self.timeline.between(self.begin, self.end):
             if not self._wait(when):
                 return
@@ -133,16 +140,39 @@ class Player:
             self.server.offer("obstacle", message, object=name)
             return
         assert isinstance(message, pb.Topology)
-        self.server.offer("topology", message, object=name)
-        self.server.put("topology", message, wait=True, object=name)
+        topology = self._complete(name, message)
+        if topology is None:
+            return
+        self.server.offer("topology", topology, object=name)
+        self.server.put("topology", topology, wait=True, object=name)
         if name in self._objects:
-            self._objects[name].nodes, self._objects[name].tets = message.nodes, len(message.tets) // 16
+            left = len(topology.tets) // 16 - len(topology.removed) // 4
+            self._objects[name].nodes, self._objects[name].tets = topology.nodes, max(left, 0)
+
+    def _complete(self, name: str, message: pb.Topology) -> pb.Topology | None:
+        """Returns a topology as a server tells it: of a cut the log has only what it changes.
+
+        None: the mesh that was cut is not in the log.
+        """
+        if message.tets or not message.cut:
+            self._whole[name] = message
+            return message
+        if name not in self._whole:
+            return None
+        topology = pb.Topology()
+        topology.CopyFrom(self._whole[name])
+        topology.cut, topology.removed = message.cut, message.removed
+        topology.triangles, topology.skin_triangles = message.triangles, message.skin_triangles
+        return topology
 
     def _step(self, name: str, message: pb.ObjectStep) -> None:
         self._batch.append(message)
         if name in self._objects:
             self._objects[name].last.CopyFrom(message)
             self._objects[name].clipped += message.clipped
+            if message.status != pb.CONVERGED:
+                self._events[name][ENUMS["status"].get(message.status, "unknown")] += 1
+            self._events[name].update(field for field in COUNTED if getattr(message, field))
             self._iterations[name].append(message.iterations)
             if name == self.timeline.scene.objects[0]:
                 self._seconds.append(message.step_seconds)
@@ -175,6 +205,8 @@ class Player:
         if self._seconds:
             status.step_p50, status.step_p99, status.step_max = np.percentile(self._seconds, [50, 99, 100]).tolist()
         for name, found in self._objects.items():
+            del found.events[:]
+            found.events.extend(pb.EventCount(event=e, steps=n) for e, n in self._events[name].most_common())
             if self._iterations[name]:
                 found.mean_iterations = float(np.mean(self._iterations[name]))
         self.server.offer("status", status)

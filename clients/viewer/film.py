@@ -51,7 +51,7 @@ class Stage:
         self._names = sorted(name for name, found in log.objects.items() if found.frames)
         if not self._names:
             raise BadInput(f"{log.path}: no frames were recorded")
-        self._surfaces: dict[tuple[str, int], Surface] = {}
+        self._surfaces: dict[str, tuple[int, Surface]] = {}  # object -> epoch and surface of the frame drawn last
         self._times = {name: np.array([f.time for f in log.frames(name)]) for name in self._names}
         self._hands = _hands(log)
         low, high = self._box()
@@ -83,10 +83,11 @@ class Stage:
 
     def _surface(self, frame: Frame) -> Surface:
         """Returns the surface of the mesh that a frame has."""
-        key = frame.object, frame.epoch
-        if key not in self._surfaces:
-            self._surfaces[key] = Surface(self._log.mesh(*key), "displacement")
-        return self._surfaces[key]
+        epoch, surface = self._surfaces.get(frame.object, (-1, None))
+        if surface is None or epoch != frame.epoch:
+            surface = Surface(self._log.mesh(frame.object, frame.epoch), "displacement")
+            self._surfaces[frame.object] = frame.epoch, surface
+        return surface
 
     def _frame(self, name: str, time: float) -> Frame:
         times = self._times[name]

@@ -45,7 +45,7 @@ class RerunScene:
     def __init__(self, recording: rr.RecordingStream, coloring: Coloring, top: float = 0.0, grow: bool = False) -> None:
         self._recording = recording
         self._coloring: Coloring = coloring
-        self._surfaces: dict[tuple[str, int], Surface] = {}
+        self._surfaces: dict[str, tuple[int, Surface]] = {}  # object -> epoch and surface of the newest one
         self._shown: dict[str, int] = {}  # object -> epoch whose triangles were logged last
         self._top, self._grow = top, grow
         self._has_contact = False
@@ -57,11 +57,12 @@ class RerunScene:
         self._log_legend()
 
     def surface(self, mesh: Mesh) -> Surface:
-        """Returns the surface of a mesh, made at the first call."""
-        key = (mesh.object, mesh.epoch)
-        if key not in self._surfaces:
-            self._surfaces[key] = Surface(mesh, self._coloring)
-        return self._surfaces[key]
+        """Returns the surface of a mesh, made when the mesh of its object changes."""
+        epoch, surface = self._surfaces.get(mesh.object, (-1, None))
+        if surface is None or epoch != mesh.epoch:
+            surface = Surface(mesh, self._coloring)
+            self._surfaces[mesh.object] = mesh.epoch, surface
+        return surface
 
     @property
     def quantities(self) -> int:

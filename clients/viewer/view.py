@@ -47,12 +47,13 @@ def color_limit(log: Log, coloring: Coloring) -> float:
     top = 0.0
     for name, found in log.objects.items():
         count = len(found.frames)
-        surfaces: dict[int, Surface] = {}
+        epoch = -1
+        surface: Surface | None = None
         for index in np.unique(np.linspace(0, count - 1, min(count, SAMPLES)).astype(int)) if count else ():
             frame = log.frame(name, int(index))
-            if frame.epoch not in surfaces:
-                surfaces[frame.epoch] = Surface(log.mesh(name, frame.epoch), coloring)
-            values = surfaces[frame.epoch].values(frame.x)
+            if surface is None or epoch != frame.epoch:
+                epoch, surface = frame.epoch, Surface(log.mesh(name, frame.epoch), coloring)
+            values = surface.values(frame.x)
             if len(values) and np.isfinite(values).all():
                 top = max(top, float(values.max() if coloring == "displacement" else np.percentile(values, 99)))
     return top

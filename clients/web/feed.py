@@ -123,10 +123,14 @@ class Link:
         """Gets the meshes again after a cut."""
         if self._cut and time.monotonic() >= self._meshes_due:
             self._meshes_due = time.monotonic() + MESH_PERIOD
-            with contextlib.suppress(ClientError):  # a late answer: the next frame has it asked for again
+            self._cut = False  # before it is asked: a frame of a later cut may come until the answer does
+            found = None
+            with contextlib.suppress(ClientError):  # a late answer
                 found = self.client.meshes()
-                if found.keys() == self.meshes.keys():
-                    self._new_meshes, self._cut = found, False
+            if found is not None and found.keys() == self.meshes.keys():
+                self._new_meshes = found
+            else:
+                self._cut = True
 
     def _ask_parameters(self) -> None:
         """Gets the parameters; a replay of a log has none, and a late answer leaves those that are known."""

@@ -16,12 +16,14 @@ import pytest
 
 from clients.client import Client
 from clients.errors import BadInput, ClientError
+from clients.log.frames import mesh_of
 from clients.replay.player import Player, speed_of
 from clients.replay.replay_server import ReplayServer
 from clients.replay.timeline import Timeline
 from protocol import messages_pb2 as pb
+from sim_server.recording.recorder import Recorder
 from tests.clients.fake_server import FakeServer
-from tests.sample_run import object_step, positions, record, topology, velocities
+from tests.sample_run import REST, TETS, header, object_step, positions, record, scene, topology, velocities
 from tests.system.link_helpers import PATIENCE, ROOT, free_endpoint
 from tests.system.server_process import Process, run, tool, until
 
@@ -94,6 +96,53 @@ def test_a_part_is_sent_with_its_meshes(log: Path) -> None:
     assert ("topology", "liver") in server.offered
     with Timeline(log) as timeline, pytest.raises(BadInput, match=r"--from 9 .*holds 0 to 0\.6 s"):
         Player(timeline, FakeReplayServer(), 1.0, begin=9.0)  # type: ignore[arg-type]
+
+
+def cut(number: int, removed: list[int]) -> pb.Topology:
+    """As a log has it: only what the cut changes."""
+    left = np.delete(TETS, removed, axis=0)[:, :3]
+    parts = {"removed": np.array(removed, "<i4").tobytes(), "triangles": left.astype("<i4").tobytes()}
+    return pb.Topology(header=header("beam"), nodes=len(REST), cut=number, **parts)
+
+
+def test_cuts_of_a_log_are_whole_meshes_to_clients_and_events_are_counted(tmp_path: Path) -> None:
+    """Of two elements one is removed from the start on, none from step 2 on, the other one from step 4 on."""
+    whole = topology("beam")
+    whole.skin_nodes, whole.skin_weights = TETS[:1].tobytes(), np.full(4, 0.25).tobytes()
+    whole.skin_triangles = np.zeros(3, "<i4").tobytes()
+    with Recorder(tmp_path / "run.mcap") as recorder:
+        recorder.scene(scene(["beam"]))
+        for time_of, message in ((0.0, whole), (0.0, cut(1, [1])), (0.03, cut(2, [])), (0.07, cut(3, [0]))):
+            recorder.topology(message, block=True, time=time_of)
+        for step in range(1, 7):
+            told = object_step("beam", step)
+            told.fallbacks, told.halvings = 2 * (step > 4), int(step == 5)
+            recorder.step(told, block=True)
+    server = FakeReplayServer()
+    with Timeline(tmp_path / "run.mcap") as timeline:
+        player = Player(timeline, server, math.inf)  # type: ignore[arg-type]
+        first = mesh_of(server.offered["topology", "beam"])  # type: ignore[arg-type]
+        assert (first.epoch, first.tets.tolist()) == (2, TETS[:1].tolist()), "a client may connect at the start"
+        for _ in range(3):  # as with --loop
+            player.play()
+    sent = [m for c, _, m in server.sent if c == "topology"]
+    meshes = [mesh_of(m) for m in sent]  # type: ignore[arg-type]
+    assert [mesh.epoch for mesh in meshes] == [1, 2, *[1, 2, 3, 4] * 3]
+    assert [mesh.tets.tolist() for mesh in meshes[2:6]] == [
+        TETS.tolist(),
+        *(TETS[k].tolist() for k in ([0], [0, 1], [1])),
+    ]
+    assert [bool(m.skin_triangles) for m in sent[2:6]] == [True, False, False, False]  # type: ignore[attr-defined]
+    status = server.offered["status", ""].objects[0]  # type: ignore[attr-defined]
+    assert (status.nodes, status.tets) == (5, 1)
+    assert {e.event: e.steps for e in status.events} == {"max_iterations": 1, "fallbacks": 2, "halvings": 1}
+
+
+def test_a_cut_of_a_mesh_that_is_not_in_the_log_is_not_offered(tmp_path: Path) -> None:
+    with Recorder(tmp_path / "run.mcap") as recorder:
+        recorder.scene(scene(["beam"]))
+        recorder.topology(cut(1, [1]))
+    assert ("topology", "beam") not in played(tmp_path / "run.mcap").offered
 
 
 def test_commands_pause_stop_and_are_refused(log: Path) -> None:

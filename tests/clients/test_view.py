@@ -8,6 +8,8 @@ import subprocess
 import sys
 import threading
 import time
+import weakref
+from dataclasses import replace
 from io import BytesIO
 from pathlib import Path
 
@@ -125,6 +127,17 @@ def test_readings_have_a_plot_of_each_quantity(tmp_path: Path) -> None:
     recording.disconnect()
     found = Rrd(tmp_path / "run.rrd").column("/plots/reading/pressure/cavity\\[1\\]\\ of\\ beam", "scalars")
     assert [(step, float(values[0])) for step, _, values in found] == [(2, 10.0), (3, 15.0)]
+
+
+def test_a_scene_holds_the_surface_of_the_newest_mesh_alone() -> None:
+    rr = pytest.importorskip("rerun")
+    from clients.viewer.rerun_scene import RerunScene
+
+    scene, mesh = RerunScene(rr.RecordingStream("test"), "displacement"), mesh_of(topology("beam"))
+    first = weakref.ref(scene.surface(mesh))
+    assert scene.surface(mesh) is first()
+    scene.surface(replace(mesh, epoch=2))
+    assert first() is None
 
 
 def test_colors_have_one_scale_for_the_run(log: Log) -> None:

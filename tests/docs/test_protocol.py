@@ -5,6 +5,7 @@ import re
 
 import pytest
 
+from clients.log import scalars
 from protocol.channels import CHANNELS, PROTOCOL, Channel
 from protocol.push_limits import LONGEST_PUSH
 from protocol.shared_memory import limits
@@ -60,6 +61,8 @@ def test_channels() -> None:
         ("protocol.md", f"at most {LONGEST_PUSH:g} s of simulation"),
         ("protocol.md", f"`ulimit -l` of {(limits.POOL_LIMIT + limits.METADATA) >> 10:,} KiB"),
         ("protocol.md", f"up to {supervisor.MAX_WORKERS} in all"),
+        ("protocol.md", f"the first {scalars.MOST_READINGS:,} names of readings"),
+        ("protocol.md", f"exerts on the first {scalars.MOST_REACTIONS} others"),
         ("scenes.md", f"at most {skin.MOST_VERTICES:,} vertices"),
         ("scenes.md", f"magnitude {skin.MOST_WEIGHT:g} at most"),
         ("use.md", f"up to {first_factors.TIMEOUT:g} s, before"),

@@ -18,8 +18,10 @@ from mcap.records import Chunk
 from mcap.writer import Writer
 
 from clients.errors import BadInput
+from clients.log import scalars
 from clients.log.reader import Log
 from protocol import log_chunks
+from protocol import messages_pb2 as pb
 from protocol.channels import PROTOCOL
 from sim_server.recording.mcap_file import McapFile
 from tests.sample_run import object_step, positions, record, state, topology
@@ -206,6 +208,39 @@ def test_what_holds_no_records_is_not_unpacked_to_its_end(compression: str, cont
         assert [frame.step for frame in log.frames("beam")] == [0, 1, 2, 3]
         assert len(log.notes) == 1 and "is damaged and left out (no records from byte" in log.notes[0]
     assert peak < 48 << 20
+
+
+def test_names_of_readings_and_reactions_are_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The first ones are kept, whatever comes later; a reaction may have a point in some steps alone."""
+    monkeypatch.setattr(scalars, "MOST_READINGS", 3)
+    monkeypatch.setattr(scalars, "MOST_REACTIONS", 2)
+    path = tmp_path / "run.mcap"
+    file = McapFile(path, "none", overwrite=False)
+    for number in range(1, 5):
+        step = object_step("beam", number)
+        for of in ("always", *(f"{number}/{k}" for k in range(2))):
+            step.readings.add(of=of, quantity="tension", value=number)
+        reaction = step.reactions.add(object="wall", force=pb.Vector(y=number))
+        if number > 2:
+            reaction.point.x = 7
+        step.reactions.add(grab=number, force=pb.Vector(x=1))
+        file.write("/step/beam", type(step), 0, 0, 0, step.SerializeToString())
+    file.finish({})
+    with Log(path) as log:
+        found = log.scalars("beam")
+        assert [name for name in found if name.startswith("reading/")] == [
+            "reading/always/tension", "reading/1/0/tension", "reading/1/1/tension",
+        ]  # fmt: skip
+        np.testing.assert_array_equal(found["reading/always/tension"], [1, 2, 3, 4])
+        np.testing.assert_array_equal(found["reading/1/1/tension"], [1, np.nan, np.nan, np.nan])
+        assert {name.split("/")[1] for name in found if name.startswith("reaction/")} == {"wall", "grab:1"}
+        np.testing.assert_array_equal(found["reaction/wall/force_y"], [1, 2, 3, 4])
+        np.testing.assert_array_equal(found["reaction/wall/point_x"], [np.nan, np.nan, 7, 7])
+        np.testing.assert_array_equal(found["reaction/grab:1/force_x"], [1, 0, 0, 0])
+        assert [note.removeprefix(f"{path}: object 'beam': ") for note in log.notes] == [
+            "more than 2 names of reactions: 3 values of further ones are left out",
+            "more than 3 names of readings: 6 values of further ones are left out",
+        ]
 
 
 def test_dropped_frames_are_told(tmp_path: Path) -> None:

@@ -4,6 +4,7 @@
 import asyncio
 import json
 import os
+import threading
 import urllib.error
 import urllib.request
 from collections.abc import Callable
@@ -17,9 +18,10 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from clients.errors import ClientError
-from clients.log.frames import Mesh, Skin
+from clients.log.frames import Frame, Mesh, Skin
+from clients.web import feed as feed_module
 from clients.web.decimate import decimated
-from clients.web.feed import Feed
+from clients.web.feed import Feed, Link
 from clients.web.hand import Hand, described_objects, grip, swept
 from clients.web.paint import BANDS, Paint, split
 from clients.web.panel.curves import POINTS, History
@@ -348,6 +350,71 @@ def test_a_page_that_ends_is_started_again_after_a_pause_that_doubles_and_given_
         end(2**restart * FIRST_PAUSE)
     end(1e6, starts=0)
     page.close()
+
+
+class CutServer:
+    """Stands in for a connection to a server that cuts a body again while it answers with the mesh before."""
+
+    def __init__(self, *_: object, **__: object) -> None:
+        self.asked = self.questions = 0
+        self.link: Link | None = None
+        self.done = threading.Event()
+        self._frames: list[Frame] = []
+
+    def told(self, epoch: int) -> None:
+        assert self.link is not None
+        self._frames = [Frame("a", epoch, epoch, 0.0, tet().rest, tet().rest)]
+        self.link.frames()
+
+    def meshes(self) -> dict[str, Mesh]:
+        self.asked += 1
+        if self.asked == 2:
+            self.told(epoch=3)  # the last frame before a pause
+        if self.asked == 3:
+            raise ClientError("late")
+        return {"a": replace(tet(), epoch=min(self.asked, 3))}
+
+    def status(self) -> pb.Status:
+        self.questions += self.asked > 1
+        if self.questions > 5 or self.asked > 3:
+            self.done.set()
+        return pb.Status()
+
+    def newest(self) -> list[Frame]:
+        found, self._frames = self._frames, []
+        return found
+
+    def scene(self) -> pb.Scene:
+        return pb.Scene(objects=["a"])
+
+    def states(self, _: object) -> "CutServer":
+        return self
+
+    def parameters(self) -> list[pb.LiveParameter]:
+        return []
+
+    def steps(self) -> None: ...
+
+    def close(self) -> None: ...
+
+    def obstacles(self) -> dict[str, object]:
+        return {}
+
+
+def test_a_page_gets_the_mesh_of_a_cut_that_came_while_it_asked(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The run is paused after the last cut, so that no other frame tells of it; one answer comes too late."""
+    monkeypatch.setattr(feed_module, "Client", CutServer)
+    monkeypatch.setattr(feed_module, "MESH_PERIOD", 0.0)
+    monkeypatch.setattr(feed_module, "STATUS_PERIOD", 0.01)
+    link = Link("sim", None)
+    try:
+        server: CutServer = link.client  # type: ignore[assignment]
+        server.link = link
+        server.told(epoch=2)
+        assert server.done.wait(60)
+    finally:
+        link.close()
+    assert link.take_meshes() == "cut" and link.meshes["a"].epoch == 3
 
 
 @pytest.mark.system
