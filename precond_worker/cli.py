@@ -50,7 +50,7 @@ def work(
     ] = "cpu",
     precision: Annotated[
         str,
-        typer.Option(metavar="auto|float32|float64", help="Of the arithmetic; auto: float32 on GPUs slow at float64"),
+        typer.Option(metavar="auto|float32|float64", help="On the GPU; auto: float32 where float64 is slow"),
     ] = "auto",
     arithmetic: Annotated[str | None, typer.Option("--arithmetic", hidden=True)] = None,
     threads: Annotated[int, typer.Option(metavar="N", min=1, max=1024, help="Threads of the linear algebra")] = 1,
@@ -111,9 +111,10 @@ def chosen_library(device: str, precision: str) -> str:
         PROGRAM.bad_input(f"--device {device}: allowed are auto, cpu, gpu")
     if precision not in ("auto", "float32", "float64"):
         PROGRAM.bad_input(f"--precision {precision}: allowed are auto, float32, float64")
-    on_cpu = "supernodal-float32" if precision == "float32" else "auto"
-    if device == "cpu" or (device == "auto" and not nvidia_device()):
-        return on_cpu
+    if device == "cpu":
+        return "auto"
+    if device == "auto" and not nvidia_device():
+        return "auto"
     from precond_worker.gpu.device import try_out
 
     try:
@@ -122,7 +123,7 @@ def chosen_library(device: str, precision: str) -> str:
         if device == "gpu":
             PROGRAM.bad_input(f"--device gpu: {error}")
         print(f"precond-worker: --device auto takes the CPU: {error}", file=sys.stderr, flush=True)
-        return on_cpu
+        return "auto"
     return "gpu" if precision == "auto" else f"gpu-{precision}"
 
 
@@ -177,8 +178,8 @@ def library_title(library: str) -> str:
         return title(library.removeprefix("gpu").removeprefix("-") or "auto")
     from precond_worker.factorization.factorize import default_library
 
-    name = default_library() if library == "auto" else library
-    if name.startswith("supernodal"):
+    name = default_library()
+    if name == "supernodal":
         from precond_worker.factorization.supernodal import native
         from sim_server.backends.build_pool import CompileError
 

@@ -15,7 +15,7 @@ from protocol.factor import FactorPattern
 __all__ = ["CHOICE", "LIBRARIES", "Analysis", "NotPositiveDefinite", "default_library"]
 
 CHOICE = "WARPFACTOR_FACTORIZATION"  # environment: one of ON_CPU
-ON_CPU = ("cholmod", "supernodal", "supernodal-float32")
+ON_CPU = ("cholmod", "supernodal")
 LIBRARIES = ("auto", *ON_CPU, "gpu", "gpu-float32", "gpu-float64")
 
 
@@ -39,8 +39,7 @@ class Analysis:
 
     pattern: supernodal pattern of L, the same for every matrix and (given the same METIS) every machine; one for
         the libraries of the CPU and another, with larger supernodes, for GPUs
-    library: "cholmod 3.0.14", "supernodal", "supernodal-float32" or the name of the GPU with the precision used,
-        "NVIDIA H200, float64"
+    library: "cholmod 3.0.14", "supernodal" or the name of the GPU with the precision used, "NVIDIA H200, float64"
 
     The matrix is taken to be symmetric: of mirrored entries one is read (permuted_csc.lower_triangle). Not for use by
     several threads at once. The BLAS may start threads: results repeat with OPENBLAS_NUM_THREADS=1, else they may
@@ -64,10 +63,10 @@ class Analysis:
     ) -> NDArray[np.floating]:
         """Returns the values of L in the order of the pattern, (pattern.nonzeros,), float32 or float64.
 
-        values: float64 (blocks, 3, 3). out: array to write to, of which the type is taken. Arithmetic is in float64 (in
-        float32 on GPUs that are slow at it, and with supernodal-float32); the same values give the same factor, bit by
-        bit. Raises ValueError for values of another shape or not finite, NotPositiveDefinite, MemoryError; the object
-        stays usable.
+        values: float64 (blocks, 3, 3). out: array to write to, of which the type is taken. Arithmetic is in float64,
+        but for L in float32 by supernodal, and on GPUs that are slow at float64; the same values give the same factor,
+        bit by bit. Raises ValueError for values of another shape or not finite, NotPositiveDefinite, MemoryError; the
+        object stays usable.
         """
         matrix = np.ascontiguousarray(values, np.float64)
         if matrix.shape != (self._blocks, BLOCK, BLOCK):
@@ -112,7 +111,7 @@ def open_library(library: str, row_start: Int32, columns: Int32) -> Library:
         return CholmodFactorization(row_start, columns)
     from precond_worker.factorization.supernodal import SupernodalFactorization
 
-    return SupernodalFactorization(row_start, columns, "float32" if chosen == "supernodal-float32" else "float64")
+    return SupernodalFactorization(row_start, columns)
 
 
 def default_library() -> str:

@@ -55,15 +55,15 @@ def native() -> c.CDLL:
 
 
 class SupernodalFactorization:
-    """Factors of one block pattern on one thread. name: as LIBRARIES names it.
+    """Factors of one block pattern on one thread.
 
-    precision: of the arithmetic for L in float32, "float32" or "float64". Where float32 leaves too few digits, of which
-    the smallest pivot tells, the factor is made again in float64. L in float64 is always computed in float64.
+    Arithmetic is in the type of L. Where float32 leaves too few digits, of which the smallest pivot tells, the factor
+    is made again in float64 and rounded.
     """
 
-    def __init__(self, row_start: Int32, columns: Int32, precision: str = "float64"):
-        self._single = precision == "float32"
-        self.name = "supernodal-float32" if self._single else "supernodal"
+    name = "supernodal"
+
+    def __init__(self, row_start: Int32, columns: Int32):
         tree = assembly_tree(eliminate(row_start, columns, order_nodes(row_start, columns)))
         self.pattern = FactorPattern.build(**tree.pattern_arrays())
         self._arrays = _arrays(tree, self.pattern, row_start, columns)  # the native code keeps their addresses
@@ -80,7 +80,7 @@ class SupernodalFactorization:
     ) -> NDArray[np.floating]:
         """Returns the values of L (factorize.Analysis.factorize)."""
         values = np.empty(self.pattern.nonzeros, dtype) if out is None else out
-        if self._single and dtype == np.float32:
+        if dtype == np.float32:
             made = self._make(matrix, values, single=True)
             if made.outcome == 0 and made.least > ROUGH:
                 return values

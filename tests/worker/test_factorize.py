@@ -21,7 +21,6 @@ except ImportError:
     LIBRARIES = ["supernodal"]
 
 library = pytest.mark.parametrize("library", LIBRARIES)
-precision = pytest.mark.parametrize("library", [*LIBRARIES, "supernodal-float32"])
 both = pytest.mark.skipif(len(LIBRARIES) < 2, reason="needs scikit-sparse")
 
 TWO_BARS = np.concatenate([bar_edges(3, 2, 4), bar_edges(2, 2, 2) + 60])
@@ -45,7 +44,7 @@ def residual(analysis: Analysis, values: NDArray, matrix: NDArray) -> float:
     return float(np.abs(lower @ lower.T - matrix[np.ix_(order, order)]).max() / np.abs(matrix).max())
 
 
-@precision
+@library
 @graphs
 def test_the_factor_multiplies_to_the_permuted_matrix(graph, library):
     analysis = Analysis(*graph, library)
@@ -139,7 +138,7 @@ def test_only_one_of_mirrored_values_is_read(library):
     assert np.array_equal(analysis.factorize(changed), analysis.factorize(values))
 
 
-@precision
+@library
 @pytest.mark.parametrize("node", [0, 20, 59])
 def test_an_indefinite_matrix_is_named_and_the_next_one_is_fine(node, library):
     graph = GRAPHS["bar"]
@@ -153,7 +152,7 @@ def test_an_indefinite_matrix_is_named_and_the_next_one_is_fine(node, library):
     assert np.array_equal(analysis.factorize(values), expected)
 
 
-@precision
+@library
 @pytest.mark.parametrize("shift", [0.0, -1e-300])
 def test_a_matrix_without_definite_pivots_is_refused(shift, library):
     graph = GRAPHS["two nodes"]
@@ -165,7 +164,7 @@ def test_a_matrix_without_definite_pivots_is_refused(shift, library):
         Analysis(*graph, library).factorize(np.zeros((4, 3, 3)))
 
 
-@precision
+@library
 def test_a_zero_on_the_diagonal_is_refused(library):
     graph = GRAPHS["chain"]
     values = spd(*graph)
@@ -174,7 +173,7 @@ def test_a_zero_on_the_diagonal_is_refused(library):
         Analysis(*graph, library).factorize(values)
 
 
-@precision
+@library
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
 def test_values_that_are_not_finite_are_refused(value, library):
     graph = GRAPHS["bar"]
@@ -185,7 +184,7 @@ def test_values_that_are_not_finite_are_refused(value, library):
         analysis.factorize(values)
 
 
-@precision
+@library
 @pytest.mark.parametrize("scale", [1e80, 1e-80])
 def test_a_factor_out_of_the_range_of_float32_is_refused_there_only(scale, library):
     graph = GRAPHS["bar"]
@@ -215,17 +214,16 @@ def test_wrong_shapes_and_types_are_named():
         analysis.factorize(spd(*graph), np.float16)
     with pytest.raises(ValueError, match=r"out of shape \(3,\), allowed: \(21,\)"):
         analysis.factorize(spd(*graph), out=np.empty(3))
-    with pytest.raises(ValueError, match="'umfpack', allowed: auto, cholmod, supernodal, supernodal-float32, gpu"):
+    with pytest.raises(ValueError, match="'umfpack', allowed: auto, cholmod, supernodal, gpu"):
         Analysis(*graph, "umfpack")
 
 
 def test_the_environment_chooses_the_library(monkeypatch):
     graph = GRAPHS["two nodes"]
-    for name in ("supernodal", "supernodal-float32"):
-        monkeypatch.setenv(CHOICE, name)
-        assert default_library() == Analysis(*graph).library == name
+    monkeypatch.setenv(CHOICE, "supernodal")
+    assert default_library() == Analysis(*graph).library == "supernodal"
     monkeypatch.setenv(CHOICE, "pardiso")
-    with pytest.raises(ValueError, match="pardiso, allowed: cholmod, supernodal, supernodal-float32"):
+    with pytest.raises(ValueError, match="pardiso, allowed: cholmod, supernodal"):
         default_library()
 
 
