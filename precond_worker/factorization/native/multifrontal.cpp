@@ -19,9 +19,11 @@
 #include <vector>
 
 #if defined(__AVX512F__)
-constexpr int BYTES = 64;
-#else
+constexpr int BYTES = 64;  // of a register
+#elif defined(__AVX__)
 constexpr int BYTES = 32;
+#else
+constexpr int BYTES = 16;
 #endif
 constexpr int64_t CACHED = 96 * 1024;  // bytes of L21 up to which `tile` is faster than a BLAS that copies its operands
 constexpr int64_t NARROW = 64;          // columns, likewise
