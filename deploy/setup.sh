@@ -218,7 +218,7 @@ install_python_packages() {
         install_cholmod
         printf '%s\n' "$now" >"$stamp"
     fi
-    have_sksparse || say "without scikit-sparse: factors come from SciPy's SuperLU, right but slower to make"
+    have_sksparse || say "without scikit-sparse: factors come from native code of our own"
 }
 
 # set_up EXTRAS [mesa-vulkan-drivers] [chromium]

@@ -171,16 +171,22 @@ def _serve(connect: list[str], threads: int, name: str, servers: list[str], shar
 
 
 def library_title(library: str) -> str:
-    """Names the library that is used. On the CPU without CHOLMOD it also prints what that costs."""
+    """Names the library that is used, ready for the first factor; ends the program if it cannot be compiled."""
     if library.startswith("gpu"):
         from precond_worker.gpu.gpu_factorization import title
 
         return title(library.removeprefix("gpu").removeprefix("-") or "auto")
     from precond_worker.factorization.factorize import default_library
 
-    name, remark = default_library()
-    if remark:
-        print(f"precond-worker: {remark}", file=sys.stderr)
+    name = default_library()
+    if name == "supernodal":
+        from precond_worker.factorization.supernodal import native
+        from sim_server.backends.build_pool import CompileError
+
+        try:
+            native()
+        except CompileError as error:
+            PROGRAM.bad_input(f"complete factors without scikit-sparse need a C++ compiler: {error}")
     return name
 
 

@@ -11,17 +11,16 @@ from precond_worker.arrays import Float64, Int32
 from precond_worker.errors import NotPositiveDefinite
 from precond_worker.symbolic.blocks import BLOCK, checked_pattern
 from protocol.factor import FactorPattern
-from protocol.process.extras import to_install
 
 __all__ = ["CHOICE", "LIBRARIES", "Analysis", "NotPositiveDefinite", "default_library"]
 
-CHOICE = "WARPFACTOR_FACTORIZATION"  # environment: cholmod or superlu
-LIBRARIES = ("auto", "cholmod", "superlu", "gpu", "gpu-float32", "gpu-float64")
-SUPERLU_COST = "SciPy's SuperLU factorizes instead of CHOLMOD, 2 to 3 times slower, so factors are older by as much"
+CHOICE = "WARPFACTOR_FACTORIZATION"  # environment: one of ON_CPU
+ON_CPU = ("cholmod", "supernodal")
+LIBRARIES = ("auto", *ON_CPU, "gpu", "gpu-float32", "gpu-float64")
 
 
 class Library(Protocol):
-    """Makes the factors: CpuFactorization or GpuFactorization."""
+    """Makes the factors: CholmodFactorization, SupernodalFactorization or GpuFactorization."""
 
     name: str
     pattern: FactorPattern
@@ -40,18 +39,19 @@ class Analysis:
 
     pattern: supernodal pattern of L, the same for every matrix and (given the same METIS) every machine; one for
         the libraries of the CPU and another, with larger supernodes, for GPUs
-    library: "cholmod 3.0.14", "superlu" or the name of the GPU with the precision used, "NVIDIA H200, float64"
+    library: "cholmod 3.0.14", "supernodal" or the name of the GPU with the precision used, "NVIDIA H200, float64"
 
     The matrix is taken to be symmetric: of mirrored entries one is read (permuted_csc.lower_triangle). Not for use by
-    several threads at once. The BLAS of CHOLMOD may start threads: results repeat with OPENBLAS_NUM_THREADS=1, else
-    they may differ in the last digits from run to run.
+    several threads at once. The BLAS may start threads: results repeat with OPENBLAS_NUM_THREADS=1, else they may
+    differ in the last digits from run to run.
     """
 
     def __init__(self, row_start: ArrayLike, columns: ArrayLike, library: str = "auto"):
         """row_start (nodes + 1,), columns (blocks,): block rows, both triangles, columns ascending.
 
-        library: one of LIBRARIES; auto: CHOLMOD, or SuperLU without it. Raises ValueError for a
-        malformed pattern, ImportError if the library is not installed, errors.DeviceUnusable without a GPU.
+        library: one of LIBRARIES; auto: CHOLMOD, or without it native code of our own, supernodal. Raises ValueError
+        for a malformed pattern, ImportError if the library is not installed, errors.DeviceUnusable without a GPU,
+        sim_server.backends.compiler.CompileError without a C++ compiler for supernodal.
         """
         start, column = checked_pattern(row_start, columns)
         self._blocks = len(column)
@@ -63,9 +63,10 @@ class Analysis:
     ) -> NDArray[np.floating]:
         """Returns the values of L in the order of the pattern, (pattern.nonzeros,), float32 or float64.
 
-        values: float64 (blocks, 3, 3). out: array to write to, of which the type is taken. Arithmetic is in float64 (in
-        float32 on GPUs that are slow at it); the same values give the same factor, bit by bit. Raises ValueError for
-        values of another shape or not finite, NotPositiveDefinite, MemoryError; the object stays usable.
+        values: float64 (blocks, 3, 3). out: array to write to, of which the type is taken. Arithmetic is in float64,
+        but for L in float32 by supernodal, and on GPUs that are slow at float64; the same values give the same factor,
+        bit by bit. Raises ValueError for values of another shape or not finite, NotPositiveDefinite, MemoryError; the
+        object stays usable.
         """
         matrix = np.ascontiguousarray(values, np.float64)
         if matrix.shape != (self._blocks, BLOCK, BLOCK):
@@ -103,25 +104,28 @@ def open_library(library: str, row_start: Int32, columns: Int32) -> Library:
         from precond_worker.gpu.gpu_factorization import GpuFactorization
 
         return GpuFactorization(row_start, columns, library.removeprefix("gpu").removeprefix("-") or "auto")
-    from precond_worker.factorization.cpu_factorization import CpuFactorization
+    chosen = default_library() if library == "auto" else library
+    if chosen == "cholmod":
+        from precond_worker.factorization.cholmod import CholmodFactorization
 
-    return CpuFactorization(row_start, columns, default_library()[0] if library == "auto" else library)
+        return CholmodFactorization(row_start, columns)
+    from precond_worker.factorization.supernodal import SupernodalFactorization
+
+    return SupernodalFactorization(row_start, columns)
 
 
-def default_library() -> tuple[str, str]:
-    """Returns what "auto" stands for, and what that costs, in one line (empty: nothing).
+def default_library() -> str:
+    """Returns what "auto" stands for: CHOLMOD where scikit-sparse is installed, else supernodal.
 
-    The environment variable WARPFACTOR_FACTORIZATION forces one of them; raises ValueError if it names another.
+    The environment variable WARPFACTOR_FACTORIZATION forces one of ON_CPU; raises ValueError if it names another.
     """
     forced = os.environ.get(CHOICE, "")
-    if forced not in ("", "cholmod", "superlu"):
-        raise ValueError(f"{CHOICE}={forced}, allowed: cholmod, superlu")
-    if forced == "superlu":
-        return "superlu", f"{CHOICE}=superlu: {SUPERLU_COST}"
+    if forced not in ("", *ON_CPU):
+        raise ValueError(f"{CHOICE}={forced}, allowed: {', '.join(ON_CPU)}")
+    if forced:
+        return forced
     try:
         import sksparse.cholmod  # noqa: F401
-    except ImportError as error:
-        if not forced:
-            needed = f"{to_install('cholmod')} builds it on Debian's libsuitesparse-dev"
-            return "superlu", f"no scikit-sparse ({error}): {SUPERLU_COST}. {needed}"
-    return "cholmod", ""
+    except ImportError:
+        return "supernodal"
+    return "cholmod"

@@ -42,13 +42,3 @@ def lower_triangle(row_start: Int32, columns: Int32, order: Int64) -> csc_matrix
     keep = row >= col
     size = BLOCK * len(order)
     return csc_matrix(coo_matrix((source[keep], (row[keep], col[keep])), shape=(size, size)))
-
-
-def mirrored(lower: csc_matrix) -> csc_matrix:
-    """Returns both triangles of a numbered lower triangle; mirrored entries have the same index."""
-    entries = lower.tocoo()
-    off = entries.row > entries.col
-    source = np.concatenate([entries.data, entries.data[off]])
-    row = np.concatenate([entries.row, entries.col[off]])
-    col = np.concatenate([entries.col, entries.row[off]])
-    return csc_matrix(coo_matrix((source, (row, col)), shape=lower.shape))

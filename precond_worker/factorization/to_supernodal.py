@@ -15,7 +15,7 @@ class Packer:
 
     CHOLMOD stores its supernodes column by column (SuiteSparse 5 and 7: change_factor copies whole panels, explicit
     zeros included), and the pattern follows its rule for merging, so that its values are copied as they are. Entries of
-    SuperLU, which leaves out zeros, and of a CHOLMOD that merges differently are scattered.
+    its LDL^T, which is not supernodal, and of a CHOLMOD that merges differently are scattered.
     """
 
     def __init__(self, pattern: FactorPattern):

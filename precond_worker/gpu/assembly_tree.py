@@ -7,57 +7,17 @@ as it is). The order is then a postorder of the merged tree; the fill without th
 The multifrontal solution of indefinite sparse symmetric linear equations, 1983.
 """
 
-from dataclasses import dataclass
-
 import numpy as np
-from numpy.typing import NDArray
 
 from precond_worker.arrays import Int64
-from precond_worker.symbolic.blocks import BLOCK, degrees_of_freedom, inverse_permutation
+from precond_worker.symbolic.assembly_tree import AssemblyTree
+from precond_worker.symbolic.blocks import BLOCK, inverse_permutation
 from precond_worker.symbolic.elimination import Elimination, postorder
 from precond_worker.symbolic.supernodes import Panel, fundamental_supernodes
 
 WIDTH = 64  # degrees of freedom that the kernels eliminate in one step (multifrontal.cu)
 ZEROS = 0.05  # largest share of explicit zeros of a merged front
 ZEROS_IN_ONE_STEP = 0.5  # the same, of a front that is eliminated in a single step
-
-
-@dataclass(frozen=True)
-class AssemblyTree:
-    """Fronts in postorder, in nodes (not degrees of freedom).
-
-    order        (n,): node eliminated k-th
-    first        (f + 1,): first column of each front
-    parent       (f,): front that takes the update matrix, -1 at a root
-    below_start  (f + 1,), below: rows under each front's own columns, ascending
-    """
-
-    order: Int64
-    first: Int64
-    parent: Int64
-    below_start: Int64
-    below: Int64
-
-    @property
-    def own(self) -> Int64:
-        """Number of columns that each front eliminates, (f,)."""
-        return np.diff(self.first)
-
-    def pattern_arrays(self) -> dict[str, NDArray[np.integer]]:
-        """Returns the arrays of a protocol.factor.FactorPattern, in degrees of freedom."""
-        height = self.own + np.diff(self.below_start)
-        start = np.concatenate([[0], np.cumsum(height)])
-        rows = np.empty(start[-1], np.int64)
-        own = np.repeat(start[:-1] - self.first[:-1], self.own) + np.arange(self.first[-1])
-        rows[own] = np.arange(self.first[-1])
-        under = np.repeat(start[:-1] + self.own - self.below_start[:-1], np.diff(self.below_start))
-        rows[under + np.arange(len(self.below))] = self.below
-        return {
-            "permutation": degrees_of_freedom(self.order).astype(np.int32),
-            "super_start": (BLOCK * self.first).astype(np.int32),
-            "row_start": (BLOCK * start).astype(np.int64),
-            "rows": degrees_of_freedom(rows).astype(np.int32),
-        }
 
 
 def assembly_tree(tree: Elimination) -> AssemblyTree:

@@ -13,8 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from precond_worker.arrays import Int32, Int64
-from precond_worker.gpu.assembly_tree import WIDTH, AssemblyTree
-from precond_worker.symbolic.blocks import BLOCK, inverse_permutation, rows_of
+from precond_worker.gpu.assembly_tree import WIDTH
+from precond_worker.symbolic.assembly_tree import AssemblyTree, entries, maps
+from precond_worker.symbolic.blocks import BLOCK, inverse_permutation
 
 CHUNK = 2  # nodes whose columns one thread block assembles (multifrontal.cu)
 ALIGN = 8  # entries: columns of a front begin at multiples
@@ -83,10 +84,10 @@ def make_plan(tree: AssemblyTree, row_start: Int32, columns: Int32) -> Multifron
     stride = -(-m[order] // ALIGN) * ALIGN
     at, half = _places(stride * m[order], level_start)
     child_start, child = _children(tree.parent, order, number)
-    maps = _maps(tree)
-    map_start, map_ = _regrouped(tree.below_start, maps, order)
-    split_start, split = _splits(tree, height, maps, order)
-    entry_start, block, row = _entries(tree, row_start, columns)
+    below = maps(tree)
+    map_start, map_ = _regrouped(tree.below_start, below, order)
+    split_start, split = _splits(tree, height, below, order)
+    entry_start, block, row = entries(tree, row_start, columns)
     return MultifrontalPlan(
         level_start, k[order], m[order], stride, at, BLOCK * tree.first[order], value[order], child_start, child,
         map_start, map_.astype(np.int32), split_start, split, entry_start, block, row, half, len(columns),
@@ -124,20 +125,6 @@ def _children(parent: Int64, order: Int64, number: Int64) -> tuple[Int64, Int64]
     return np.concatenate([[0], np.cumsum(counts)]), number[by_parent]
 
 
-def _maps(tree: AssemblyTree) -> Int64:
-    """Returns, for each row below a front, its position in the parent's front, in the order of tree.below."""
-    fronts = np.repeat(np.arange(len(tree.parent)), np.diff(tree.below_start))
-    return _place(tree, tree.parent[fronts], tree.below)
-
-
-def _place(tree: AssemblyTree, front: Int64, row: Int64) -> Int64:
-    """Returns the position of a row in the rows of a front: own columns first, then those below."""
-    nodes = len(tree.order)
-    keys = np.repeat(np.arange(len(tree.parent)), np.diff(tree.below_start)) * nodes + tree.below
-    below = np.searchsorted(keys, front * nodes + row) - tree.below_start[front] + tree.own[front]
-    return np.where(row < tree.first[front + 1], row - tree.first[front], below)
-
-
 def _regrouped(start: Int64, values: Int64, order: Int64) -> tuple[Int64, Int64]:
     """Permutes lists of fronts; returns their starts and values."""
     length = np.diff(start)[order]
@@ -156,15 +143,3 @@ def _splits(tree: AssemblyTree, height: Int64, maps: Int64, order: Int64) -> tup
     keys = np.repeat(np.arange(len(chunks)), np.diff(tree.below_start)) * wide + maps
     found = np.searchsorted(keys, front * wide + np.minimum(first_node, wide - 1)) - tree.below_start[front]
     return start[:-1][order], found.astype(np.int32)
-
-
-def _entries(tree: AssemblyTree, row_start: Int32, columns: Int32) -> tuple[Int64, Int32, Int32]:
-    """Returns the blocks of A by column; of two mirrored ones that in the row eliminated later, as on the CPU."""
-    rank = inverse_permutation(tree.order)
-    row, column = rank[rows_of(row_start)], rank[columns]
-    block = np.flatnonzero(row >= column)
-    block = block[np.lexsort((row[block], column[block]))]
-    front = np.repeat(np.arange(len(tree.parent)), tree.own)
-    place = _place(tree, front[column[block]], row[block])
-    start = np.searchsorted(column[block], np.arange(len(tree.order) + 1))
-    return start, block.astype(np.int32), place.astype(np.int32)

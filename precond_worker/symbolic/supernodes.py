@@ -9,9 +9,9 @@ values are in the order of the pattern without a search.
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from precond_worker.symbolic.blocks import BLOCK, degrees_of_freedom
+from precond_worker.symbolic.assembly_tree import AssemblyTree
+from precond_worker.symbolic.blocks import BLOCK
 from precond_worker.symbolic.elimination import Elimination
 
 # A panel of at most this many columns may hold up to this share of explicit zeros.
@@ -78,14 +78,12 @@ def worth_merging(joint: Panel, zeros_before: int) -> bool:
     return joint.zeros == zeros_before or any(joint.width <= width and share < most for width, most in ZEROS_BY_WIDTH)
 
 
-def pattern_arrays(tree: Elimination) -> dict[str, NDArray[np.integer]]:
-    """Returns the arrays of a protocol.factor.FactorPattern: permutation, super_start, row_start and rows."""
+def assembly_tree(tree: Elimination) -> AssemblyTree:
+    """Returns the relaxed supernodes as fronts."""
     panels = relaxed_supernodes(tree)
-    own = [np.arange(panel.first, panel.last + 1) for panel in panels]
-    rows = [np.concatenate([nodes, tree.rows_below(nodes[-1])]) for nodes in own]
-    return {
-        "permutation": degrees_of_freedom(tree.order).astype(np.int32),
-        "super_start": np.cumsum([0, *(panel.width for panel in panels)]).astype(np.int32),
-        "row_start": np.cumsum([0, *(BLOCK * len(nodes) for nodes in rows)]).astype(np.int64),
-        "rows": degrees_of_freedom(np.concatenate(rows)).astype(np.int32),
-    }
+    first = np.array([0, *(panel.last + 1 for panel in panels)])
+    owner = np.repeat(np.arange(len(panels)), np.diff(first))
+    up = tree.parent[first[1:] - 1]
+    below = [tree.rows_below(panel.last) for panel in panels]
+    below_start = np.cumsum([0, *map(len, below)])
+    return AssemblyTree(tree.order, first, np.where(up >= 0, owner[up], -1), below_start, np.concatenate(below))

@@ -384,8 +384,10 @@ def _without_skins(resolved: Any) -> Any:
 
 def _library(name: str) -> str:
     """Option of Analysis for a library as named in a log, such as "cholmod 3.0.14" or "NVIDIA H200, float64"."""
+    from precond_worker.factorization.factorize import ON_CPU
+
     gpu = next((f"gpu-{kind}" for kind in ("float32", "float64") if name.endswith(f", {kind}")), "")
-    return gpu or next((known for known in ("cholmod", "superlu") if name.split()[0] == known), "auto")
+    return gpu or next((known for known in ON_CPU if name.split()[0] == known), "auto")
 
 
 def _usable(library: str) -> bool:

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import logging
 from abc import abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -17,8 +16,6 @@ from sim_server.arrays import Float64, Int32
 
 if TYPE_CHECKING:
     from precond_worker.factorization.registry import Factorization
-
-log = logging.getLogger(__name__)
 
 EXACT = Method()
 
@@ -118,7 +115,6 @@ class Inline(FactorSource):
         self._patterns, self._library = patterns, library
         self._analyses: dict[tuple[str, Method], Factorization] = {}
         self._latest: dict[str, Method] = {}
-        self._warned = False
         self._done: list[Factor] = []
         self._failed: list[tuple[str, str]] = []
 
@@ -157,14 +153,10 @@ class Inline(FactorSource):
         return str(self._analysis(name, chosen).library)
 
     def _analysis(self, name: str, method: Method) -> Factorization:
-        from precond_worker.factorization.factorize import default_library
         from precond_worker.factorization.registry import make_factorization
 
         self._latest[name] = method
         if (name, method) not in self._analyses:
-            if method == EXACT and not self._warned and (message := default_library()[1]):
-                self._warned = True
-                log.warning("%s", message)
             self._analyses[name, method] = make_factorization(*self._patterns[name], method, self._library)
         return self._analyses[name, method]
 

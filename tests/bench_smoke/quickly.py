@@ -14,9 +14,9 @@ from typing import Any
 
 ROOT = Path(__file__).resolve().parents[2]
 UNKNOWN = ("age", "next factor")  # may be unknown in any bench
-UNKNOWN_IN = {  # of other steps; without a goal; of a step not ours; without potential energy, or an estimate
+UNKNOWN_IN = {  # of other steps; without a goal; of a step not ours; without CHOLMOD; without energy, or an estimate
     "accuracy": ("step error", "solve error"), "contact": ("goal ms", "loop ms"),
-    "cpu": ("iterations", "residual", "wall"), "rosenbrock": ("energy", "estimate"),
+    "cpu": ("iterations", "residual", "wall"), "factors": ("of CHOLMOD",), "rosenbrock": ("energy", "estimate"),
 }  # fmt: skip
 TIME = float(os.environ.get("PYTEST_TIMEOUT", 120)) - 10  # s, less than the test may take
 WITHOUT_PICTURE = ("faults", "gallery")

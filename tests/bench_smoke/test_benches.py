@@ -10,7 +10,8 @@ from tests.bench_smoke.quickly import ROOT, writes_its_report
 
 PAPER = ("table1", "table2 bend, springs", "table5", "policies", "extrapolations", "automatic", "figure4", "publishing")
 BENCHES = {
-    "accuracy": [], "contact": [], "cutting": [], "effects": [], "elements": [], "explicit": [], "hard_cases": [],
+    "accuracy": [], "contact": [], "cutting": [], "effects": [], "elements": [], "explicit": [],
+    "factors": ["--library", "SciPy's SuperLU", "supernodal"], "hard_cases": [],
     "models": ["--devices", "cpu"],
     "paper": ["--device", "cpu", "--only", *PAPER], "preconditioners": [], "rosenbrock": [], "scheduler": [],
     "verification": [], "warp": [],
@@ -26,4 +27,4 @@ def test_bench_writes_its_report(name: str, tmp_path: Path) -> None:
 
 def test_every_bench_is_started() -> None:
     there = {path.parent.name for path in (ROOT / "tests/bench").glob("*/__main__.py")}
-    assert there - {"gpu", "gpu_worker"} == {*BENCHES, *with_workers.BENCHES}
+    assert there - {"gpu"} == {*BENCHES, *with_workers.BENCHES}

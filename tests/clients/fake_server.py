@@ -43,7 +43,7 @@ class FakeServer:
         for name in self.objects:
             last = object_step(name, 50)
             found.objects.append(pb.ObjectStatus(object=name, nodes=5, tets=2, last=last, low=LOW, high=TIP, tip=TIP))
-        found.workers.append(pb.WorkerInfo(worker="w1", host="here", pid=1, library="superlu", threads=1, jobs=3))
+        found.workers.append(pb.WorkerInfo(worker="w1", host="here", pid=1, library="supernodal", threads=1, jobs=3))
         return found
 
     def publish(self, step: int) -> None:

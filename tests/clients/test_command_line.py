@@ -49,7 +49,7 @@ def test_status(server: FakeServer) -> None:
     code, out, _ = run("status", "--connect", server.endpoint)
     assert code == 0
     assert "made-up.toml" in out and "running, step 50" in out and "p99 6.00 ms" in out
-    assert "liver" in out and "block_jacobi" not in out and "superlu" in out
+    assert "liver" in out and "block_jacobi" not in out and "supernodal" in out
 
 
 def test_status_as_json(server: FakeServer) -> None:

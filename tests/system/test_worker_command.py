@@ -89,14 +89,29 @@ def test_it_waits_for_the_server_and_says_so_once_and_ends_when_told(number: sig
 def test_it_compiles_before_a_server_waits_for_it(
     compiler: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Also a worker that cannot comes so far: complete factors need no compiler."""
-    (tmp_path / "c++").write_text(f'#!/bin/sh\n[ "$1" != --version ] || exec g++ --version\n{compiler}\n')
-    (tmp_path / "c++").chmod(0o755)
-    monkeypatch.setenv("CXX", str(tmp_path / "c++"))
-    monkeypatch.setenv("WARPFACTOR_CACHE", str(tmp_path / "cache"))
+    """Also a worker that cannot comes so far: CHOLMOD needs no compiler."""
+    pytest.importorskip("sksparse.cholmod")
+    compile_by(compiler, tmp_path, monkeypatch)
+    monkeypatch.setenv("WARPFACTOR_FACTORIZATION", "cholmod")
     with process("-m", "precond_worker", "--connect", free_endpoint(), "--name", "early") as child:
         assert child.stderr is not None and "trying until the server is there" in child.stderr.readline()
         assert len(list((tmp_path / "cache").glob("incomplete-*.so"))) == (compiler != "exit 1")
+
+
+def test_a_worker_that_can_make_no_factor_says_so_and_ends(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    compile_by("exit 1", tmp_path, monkeypatch)
+    monkeypatch.setenv("WARPFACTOR_FACTORIZATION", "supernodal")
+    done = run("--connect", free_endpoint())
+    assert done.returncode == 2 and "Traceback" not in done.stderr
+    assert "complete factors without scikit-sparse need a C++ compiler" in done.stderr
+
+
+def compile_by(command: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A compiler that runs `command` of the shell, and a cache without libraries."""
+    (folder / "c++").write_text(f'#!/bin/sh\n[ "$1" != --version ] || exec g++ --version\n{command}\n')
+    (folder / "c++").chmod(0o755)
+    monkeypatch.setenv("CXX", str(folder / "c++"))
+    monkeypatch.setenv("WARPFACTOR_CACHE", str(folder / "cache"))
 
 
 def test_a_second_worker_of_one_name_is_told_and_leaves() -> None:

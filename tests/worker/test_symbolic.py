@@ -99,14 +99,14 @@ def test_without_metis_the_order_still_reduces_fill(missing, monkeypatch):
     natural = np.arange(len(order))
     assert eliminate(*BAR, order).count.sum() < 0.8 * eliminate(*BAR, natural).count.sum()
     values = spd(*BAR)
-    analysis = Analysis(*BAR, "superlu")
+    analysis = Analysis(*BAR, "supernodal")
     lower = supernodal.lower(analysis.pattern, analysis.factorize(values, np.float64))
     order = analysis.pattern.permutation
     np.testing.assert_allclose(lower @ lower.T, dense_matrix(*BAR, values)[np.ix_(order, order)], atol=1e-12)
 
 
 def test_a_library_factor_outside_the_pattern_is_an_error():
-    analysis = Analysis(*pattern(3, np.array([[0, 1]])), "superlu")
+    analysis = Analysis(*pattern(3, np.array([[0, 1]])), "supernodal")
     dense = np.tril(np.ones((9, 9)))
     out = np.empty(analysis.pattern.nonzeros)
     with pytest.raises(RuntimeError, match="does not fit"):

@@ -146,7 +146,7 @@ def options() -> argparse.Namespace:
     parser.add_argument("--sizes", type=int, nargs="+", choices=list(BARS), help="of one beam [default: all]")
     parser.add_argument("--materials", nargs="+", choices=MATERIALS, default=list(MATERIALS))
     parser.add_argument("--beams", type=int, default=1024, help="largest batch")
-    parser.add_argument("--library", default="auto", help="that factorizes: auto, gpu, cholmod, superlu")
+    parser.add_argument("--library", default="auto", help="that factorizes: auto, gpu, cholmod, supernodal")
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="of every scene")
     parser.add_argument(
         "--quick", action="store_true", help="two rounds; 540 and 3000 tets unless --sizes; batches up to 16"

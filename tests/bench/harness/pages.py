@@ -22,6 +22,7 @@ PAGES = (
     "accuracy",
     "hard_cases",
     "effects",
+    "factors",
     "scheduler",
     "scaling",
     "haptics",

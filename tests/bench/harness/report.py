@@ -98,7 +98,7 @@ def versions() -> dict[str, str]:
     from sim_server.backends.compiler import compiler
 
     found = {"python": platform.python_version(), **{p: _version(p) for p in PACKAGES}}
-    return {**found, "factorization": default_library()[0], "compiler": _first_line([compiler(), "--version"])}
+    return {**found, "factorization": default_library(), "compiler": _first_line([compiler(), "--version"])}
 
 
 def commit() -> str:
