@@ -5,6 +5,7 @@ import tempfile
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -39,7 +40,9 @@ def run(record: Path | None) -> None:
             shown = summary(log)
     Console().print(shown)
     print(f"{time.monotonic() - began:.1f} s in all" + (f"; the log: {record}" if record else ""))
-    print("drag it in a browser: sim-server gallery/creature --workers 1 --web; more scenes: sim-server --list")
+    if find_spec("viser") is not None:
+        print("drag it in a browser: sim-server gallery/creature --workers 1 --web")
+    print("more scenes: sim-server --list")
 
 
 def _play(client: Client) -> None:
