@@ -12,6 +12,7 @@ from types import TracebackType
 from typing import Any, Self
 
 import numpy as np
+import scipy  # noqa: F401  where it is needed it is imported later: a client alone is told of it here
 from numpy.typing import ArrayLike, NDArray
 
 from sim_server import mesh as meshes

@@ -54,6 +54,9 @@ def test_what_needs_an_extra_names_it() -> None:
     assert found.returncode == 1
     (line,) = found.stderr.splitlines()
     assert line.startswith("sim-server: this needs the package ") and "of the extra server: " in line
+    accuracy = "sys.argv[1:] = ['accuracy', 'a.toml']\nfrom clients.__main__ import main\nmain()"
+    (line,) = bare(accuracy).stderr.splitlines()
+    assert line.startswith("sim-client: this needs the package ") and "of the extra server: " in line
     assert missing_extra(ModuleNotFoundError("no", name="viser.theme")).startswith(
         "this needs the package viser, of the extra web: "
     )
