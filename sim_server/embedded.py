@@ -4,7 +4,6 @@
 Steps wait for the factors of their matrices, which this process makes, as often as the scene's `update` says.
 """
 
-import hashlib
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -36,11 +35,6 @@ class Mesh:
         self.checked = meshes.check(
             meshes.Mesh(_array(points, 3, "points", "fiu"), _array(tets, 4, "tets", "iu"), name)
         )
-
-    @property
-    def digest(self) -> str:
-        """Names the mesh in the table of a scene."""
-        return hashlib.sha256(self.points.tobytes() + self.tets.tobytes()).hexdigest()[:24]
 
     @property
     def points(self) -> Float64:
@@ -211,7 +205,7 @@ def _triple(values: Sequence[float]) -> tuple[float, float, float]:
 
 
 def _without_meshes(table: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, meshes.Mesh]]:
-    """Returns the table with digests in the place of meshes, and the meshes by the names of their objects."""
+    """Returns the table with meshes as scenes take them, and these by the names of their objects."""
     objects, given = table.get("object"), {}
     if not isinstance(objects, list | tuple):
         return dict(table), {}
@@ -219,6 +213,6 @@ def _without_meshes(table: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str,
     for o in objects:
         if isinstance(o, Mapping) and isinstance(mesh := o.get("mesh"), Mesh):
             given[str(o.get("name"))] = mesh.checked
-            o = {**o, "mesh": {"arrays": mesh.digest}}
+            o = {**o, "mesh": mesh.checked}
         plain.append(o)
     return {**table, "object": plain}, given

@@ -3,6 +3,7 @@
 
 from dataclasses import replace
 from functools import partial
+from hashlib import sha256
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -52,6 +53,14 @@ class MeshSource(Parameters):
     )
     file: File | None = Field(default=None, description="a file that meshio reads")
     arrays: str | None = Field(default=None, description="digest of a mesh that a program gives; not for scene files")
+
+    @model_validator(mode="before")
+    @classmethod
+    def _of_a_program(cls, table: Any) -> Any:
+        """Names a mesh that a program gives; the object gets it by `use_mesh`."""
+        if isinstance(table, Mesh):
+            return {"arrays": sha256(table.rest.tobytes() + table.tets.tobytes()).hexdigest()[:24]}
+        return table
 
     @model_validator(mode="before")
     @classmethod

@@ -102,7 +102,6 @@ BAD = {
     "tets": (lambda s: wf.Mesh(GRID.rest, [[0.0, 1, 2, 3]]), r"tets has shape \(1, 4\) and type float64: must be"),
     "a flat one": (lambda s: wf.Mesh([[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]], [[0, 1, 2, 3]]), "mesh arrays: "),
     "a key": (lambda s: wf.Scene({"dt": 0.1, "objekt": []}), "from Python, objekt"),
-    "arrays in a file": (lambda s: wf.Simulation(falling({"arrays": "0f"})), "mesh.arrays = '0f'.* has bar or file"),
     "no steps": (lambda s: s.step(0), r"step\(0\): must be at least 1"),
     "an object": (lambda s: s.positions("ball"), "no object 'ball'; there is cube"),
     "a push": (lambda s: s.push("cube", "nose", (0, 0, 1), 1), "push: no point 'nose'; known: tip, "),
