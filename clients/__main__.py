@@ -28,6 +28,7 @@ from protocol.network.web_address import HOST, PORT
 from protocol.printable import printable
 from protocol.process.command_line import Program, handle, leave
 from protocol.process.exhausted import exhausted
+from protocol.process.extras import missing_extra
 from protocol.push_limits import ORPHANED_PUSH
 
 if TYPE_CHECKING:
@@ -835,7 +836,7 @@ def main() -> None:
     except BaseException as error:
         if interrupted:  # the interrupt may have become another error, e.g. of an import
             leave()
-        if not (text := exhausted(error)):
+        if not (text := exhausted(error) or missing_extra(error)):
             raise
         print(f"sim-client: {text}", file=sys.stderr)
         sys.exit(1)

@@ -21,6 +21,7 @@ import typer
 
 from protocol.network.endpoints import BadEndpoint, check_endpoint, on_this_machine
 from protocol.process.command_line import Program, Terminated, end_in_order
+from protocol.process.own_python import own_module
 from sim_server.errors import InputError
 from sim_server.scene import Scene, load
 from sim_server.service.supervisor import Supervisor, worker_process
@@ -139,7 +140,7 @@ class Fleet:
             path = Path(self._folder.name) / f"{name}.toml"
             path.write_text(part_of(self._scene, part))
             record = ["--record", str(self._record / f"{name}.mcap")] if self._record else []
-            command = [sys.executable, "-m", "sim_server", str(path), "--name", name, "--listen", listen]
+            command = own_module("sim_server", str(path), "--name", name, "--listen", listen)
             out = sys.stderr if self._quiet else None
             command += [*record, *server_options]
             self.servers.append(subprocess.Popen(command, stdout=out, env=environment_with(gpu)))

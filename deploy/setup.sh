@@ -204,7 +204,7 @@ install_cholmod() {
 }
 
 install_python_packages() {
-    local extras=$1 stamp now
+    local extras=server,mesh,$1 stamp now
     have_gpu && extras=$extras,gpu
     stamp=$venv/setup-$extras.sha256
     now=$(fingerprint "$extras")

@@ -19,6 +19,7 @@ ALLOWED = {  # what each folder imports of its package
     "precond_worker.factorization": {"arrays", "errors", "gpu", "symbolic"},
     "precond_worker.network": {"errors", "remote_assembly"},
     "clients.accuracy": {"errors", "load_test", "log", "progress", "watch"},
+    "clients.demo": {"client", "errors", "load_test", "log"},
     "clients.haptics": {"client", "errors", "obstacle"},
     "clients.log": {"errors"},
     "clients.web": {"client", "errors", "log", "viewer"},
@@ -29,7 +30,8 @@ ALLOWED = {  # what each folder imports of its package
 }
 ORDER = (  # of sim_server: each imports of those before it
     "errors", "arrays", "kernels", "mesh", "scene", "backends", "mechanics", "effects", "parameters", "simulation",
-    "state", "updates", "checkpoint", "network", "recording", "service", "explain", "replay", "cli", "__main__",
+    "state", "updates", "checkpoint", "network", "recording", "service", "explain", "replay", "embedded", "cli",
+    "__main__",
 )  # fmt: skip
 REGISTRY = ("scene", "effects")  # a scene looks the names of effects up; the effects that it lists are imported later
 

@@ -8,6 +8,7 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 ALLOWED = {
+    "warpfactor": {"warpfactor", "protocol", "clients", "sim_server"},  # the public face of all others
     "protocol": {"protocol"},
     "sim_server": {"sim_server", "protocol"},
     "precond_worker": {"precond_worker", "protocol"},
@@ -70,3 +71,13 @@ def test_tests_of_the_product_import_no_bench() -> None:
             modules = imported(node, path)
             for module in [*modules, *(f"{modules[0]}.{name}" for name in names)]:
                 assert not f"{module}.".startswith(("tests.bench.", "tests.bench_smoke.")), f"{path} imports {module}"
+
+
+def test_the_public_face_stays_small() -> None:
+    lines = sum(len(path.read_text().splitlines()) for path in (ROOT / "warpfactor").glob("*.py"))
+    assert lines <= 60 and (ROOT / "warpfactor/py.typed").is_file()
+
+
+def test_the_top_level_holds_the_packages_and_no_module() -> None:
+    assert {path.parent.name for path in ROOT.glob("*/__init__.py")} - {"tests"} == {*ALLOWED}
+    assert list(ROOT.glob("*.py")) == []

@@ -48,7 +48,7 @@ def render(found: Points) -> str:
         from plotly.io import to_html
         from plotly.subplots import make_subplots
     except ImportError:
-        raise ClientError(f"plotly is not installed: {to_install('view')}") from None
+        raise ClientError(f"plotly is not installed, of the extra view: {to_install('view')}") from None
     figure = make_subplots(1, 2, subplot_titles=TITLES, shared_yaxes=True, shared_xaxes="all", horizontal_spacing=0.03)
     _points(figure, go, found)
     figure.update_layout(height=620, template="plotly_white", legend={"groupclick": "togglegroup"})

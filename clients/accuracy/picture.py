@@ -23,7 +23,7 @@ def draw(found: Points) -> bytes:
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure
     except ImportError:
-        raise ClientError(f"matplotlib is not installed: {to_install('view')}") from None
+        raise ClientError(f"matplotlib is not installed, of the extra view: {to_install('view')}") from None
     figure = Figure(figsize=(14, 9), dpi=100, layout="constrained")
     FigureCanvasAgg(figure)
     grid = figure.add_gridspec(2, 2, height_ratios=[3, 1])

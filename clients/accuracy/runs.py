@@ -6,7 +6,6 @@ from __future__ import annotations
 import json
 import os
 import subprocess
-import sys
 import tempfile
 import time
 from collections.abc import Callable
@@ -22,6 +21,7 @@ from clients.accuracy.trajectories import Trajectory, read_trajectory
 from clients.errors import BadInput, ClientError
 from clients.load_test.processes import end, free_endpoint
 from clients.log.reader import Log
+from protocol.process.own_python import own_module
 
 LOG_FOLDER = "warpfactor-accuracy-"  # and more letters: folder of the log of a run
 POLL = 0.05  # s between looks at a process
@@ -89,7 +89,7 @@ def run_point(
 def command(task: Task, settings: Settings, workers: int, log: Path, endpoint: str) -> list[str]:
     """Returns the command line of a run."""
     dt = time_step(task, settings)
-    words = [sys.executable, "-m", "sim_server", str(task.scene), "--free-run", "--quiet", "--record", str(log)]
+    words = own_module("sim_server", str(task.scene), "--free-run", "--quiet", "--record", str(log))
     words += ["--steps", str(round(task.duration / dt)), "--device", task.device]
     words += ["--name", f"accuracy-{os.getpid()}", "--listen", endpoint, "--workers", str(workers)]
     if workers and task.device != "cpu":

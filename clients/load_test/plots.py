@@ -18,7 +18,7 @@ def draw(found: dict[str, Any]) -> bytes:
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure
     except ImportError:
-        raise ClientError(f"matplotlib is not installed: {to_install('view')}") from None
+        raise ClientError(f"matplotlib is not installed, of the extra view: {to_install('view')}") from None
     figure = Figure(figsize=(12.8, 8), dpi=100, layout="constrained")
     FigureCanvasAgg(figure)
     plots = figure.subplots(2, 2)

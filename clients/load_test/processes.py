@@ -8,7 +8,6 @@ import json
 import os
 import socket
 import subprocess
-import sys
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
@@ -17,6 +16,7 @@ from typing import Any
 
 from clients.client import Client
 from clients.errors import ClientError
+from protocol.process.own_python import own_module
 
 START_TIMEOUT = 120.0  # s for a server to start: many bodies, kernels to compile
 END_TIMEOUT = 15.0  # s for a process to end before it is killed
@@ -35,7 +35,7 @@ def server(scene: Path, log: Path, name: str, endpoint: str, workers: int, devic
     """Runs `sim-server` in real time, with a log, for the block. Raises ClientError if it fails to start."""
     output = log.with_suffix(".txt")
     command = [
-        *(sys.executable, "-m", "sim_server", str(scene), "--record", str(log), "--name", name),
+        *own_module("sim_server", str(scene), "--record", str(log), "--name", name),
         *("--listen", endpoint, "--workers", str(workers), "--device", device),
     ]
     if device == "gpu":
@@ -95,7 +95,7 @@ class ClientProcesses:
         with self._closing as closing:
             for number in range(count):
                 process = subprocess.Popen(
-                    [sys.executable, "-m", "clients.load_test.client_process"],
+                    own_module("clients.load_test.client_process"),
                     stdin=subprocess.PIPE,
                     stdout=subprocess.PIPE,
                     text=True,

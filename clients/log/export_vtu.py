@@ -9,11 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from clients.errors import BadInput
+from clients.errors import BadInput, ClientError
 from clients.log.atomic_file import atomic_file
 from clients.log.frames import Frame, Mesh
 from clients.log.reader import Log
 from clients.log.von_mises import StressField
+from protocol.process.extras import to_install
 
 
 def write_vtu(
@@ -69,8 +70,10 @@ def _write(path: Path, frame: Frame, mesh: Mesh) -> list[Path]:
 
 def _write_mesh(path: Path, *parts: Any) -> None:
     """Writes points, cells, point data and cell data."""
-    import meshio
-
+    try:
+        import meshio
+    except ImportError:
+        raise ClientError(f"meshio is not installed, of the extra mesh: {to_install('mesh')}") from None
     with atomic_file(path) as part:
         meshio.Mesh(*parts).write(part, file_format="vtu")
 

@@ -17,6 +17,7 @@ from clients.replay.replay_server import ReplayServer
 from clients.replay.timeline import Timeline
 from protocol.channels import SERVER_NAME
 from protocol.printable import printable
+from protocol.process.own_python import own_module
 
 
 def republish(
@@ -50,7 +51,7 @@ def republish(
 
 def simulate(log: Path, as_json: bool) -> int:
     """Runs the log again in a process of the server's program; returns its exit code: 0 same, 1 diverged, 2 bad log."""
-    command = [sys.executable, "-m", "sim_server.replay", str(log), *(["--json"] if as_json else [])]
+    command = own_module("sim_server.replay", str(log), *(["--json"] if as_json else []))
     process = subprocess.Popen(command)
     try:
         return process.wait()

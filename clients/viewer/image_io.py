@@ -30,7 +30,8 @@ def encoded(png: bytes, kind: Kind) -> bytes:
     try:
         from PIL import Image
     except ImportError:
-        raise ClientError(f"Pillow is not installed: {to_install('view')}, or ask for a .png") from None
+        advice = f"{to_install('view')}, or ask for a .png"
+        raise ClientError(f"Pillow is not installed, of the extra view: {advice}") from None
     file = BytesIO()
     with Image.open(BytesIO(png)) as picture:
         picture.convert("RGB").save(file, kind, quality=QUALITY)

@@ -72,7 +72,7 @@ def paint(pieces: Sequence[Piece], camera: Camera, size: tuple[int, int], floor:
     try:
         from PIL import Image, ImageDraw, ImageFilter
     except ImportError:
-        raise ClientError(f"Pillow is not installed: {to_install('view')}") from None
+        raise ClientError(f"Pillow is not installed, of the extra view: {to_install('view')}") from None
     width, height = FINER * size[0], FINER * size[1]
     image = Image.new("RGB", (width, height), SKY)
     if floor is not None:

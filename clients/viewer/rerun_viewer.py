@@ -23,7 +23,7 @@ def viewer_binary() -> Path:
     """Returns the path of the viewer itself: the command `rerun` is a Python wrapper that leaves it running."""
     spec = importlib.util.find_spec("rerun_cli")
     if spec is None or spec.origin is None:
-        raise ClientError(f"rerun-sdk is not installed: {to_install('view')}")
+        raise ClientError(f"rerun-sdk is not installed, of the extra view: {to_install('view')}")
     return Path(spec.origin).with_name("rerun")
 
 

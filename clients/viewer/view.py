@@ -207,5 +207,5 @@ def _recording() -> rr.RecordingStream:
     try:
         import rerun as rr
     except ImportError:
-        raise ClientError(f"rerun-sdk is not installed: {to_install('view')}") from None
+        raise ClientError(f"rerun-sdk is not installed, of the extra view: {to_install('view')}") from None
     return rr.RecordingStream("warpfactor")

@@ -41,7 +41,7 @@ def shown(host: str, port: int) -> str:
 def hindrance(host: str, port: int) -> str:
     """Returns why the page cannot be served there, and what helps; empty if it can be."""
     if find_spec("viser") is None:
-        return f"the page in a browser needs viser: {to_install('web')}"
+        return f"the page in a browser needs viser, of the extra web: {to_install('web')}"
     try:
         family, kind, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
         with socket.socket(family, kind) as probe:

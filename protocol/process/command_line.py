@@ -16,6 +16,7 @@ from typing import Any, NoReturn
 import typer
 
 from protocol.process.exhausted import exhausted
+from protocol.process.extras import missing_extra
 
 RETRY = 0.01  # s until a signal that came in the middle of an import is handled again
 
@@ -48,7 +49,8 @@ class Program:
         raise typer.Exit(2)
 
     def run(self, command: Callable[..., Any]) -> None:
-        """Runs the command line; ends with code 130 after Ctrl-C, with a line and code 1 when a resource ran out."""
+        """Runs the command line; ends with code 130 after Ctrl-C, with a line and code 1 when a resource ran out
+        or a package of an extra is missing."""
         try:
             command(prog_name=self.name)
         except SystemExit as ended:
@@ -56,7 +58,7 @@ class Program:
                 leave()
             raise
         except BaseException as error:
-            if not (text := exhausted(error)):
+            if not (text := exhausted(error) or missing_extra(error)):
                 raise
             print(f"{self.name}: {text}", file=sys.stderr)
             sys.exit(1)
@@ -79,7 +81,7 @@ def handle(number: signal.Signals, act: Callable[[int, FrameType | None], object
     """
 
     def handler(number: int, frame: FrameType | None) -> None:
-        if _importing(frame):
+        if _importing(frame) and hasattr(signal, "setitimer"):  # Windows has none
             signal.signal(signal.SIGALRM, lambda *_: signal.raise_signal(number))
             signal.setitimer(signal.ITIMER_REAL, RETRY)
         else:

@@ -6,7 +6,6 @@ zenoh locks every shared memory pool it creates or reads. A reader over its limi
 """
 
 import os
-import resource
 from pathlib import Path
 
 SHM = Path("/dev/shm")
@@ -29,6 +28,8 @@ def obstacle(pools: int = POOL_LIMIT) -> str:
     """Says why pools of `pools` bytes cannot be used here; empty if they can."""
     if not os.access(SHM, os.W_OK | os.X_OK):
         return f"{SHM} is not writable"
+    import resource  # Windows, where clients run, has none, and no /dev/shm
+
     needed = pools + METADATA
     longest, _ = resource.getrlimit(resource.RLIMIT_FSIZE)  # limits segments of shared memory, too, as they are files
     if longest != resource.RLIM_INFINITY and longest < needed:

@@ -2,7 +2,8 @@
 """Compiles kernel texts and host-only C++ texts for the CPU and keeps the libraries.
 
 One `.cu` text serves both compilers (kernels/kernel.h). Here the system C++ compiler builds it into a shared library
-that ctypes loads, cached by source, headers, flags, compiler and processor. Arguments: kernel_binding.py.
+that ctypes loads, cached by source, headers, flags, compiler and processor. A wheel brings libraries of the texts of
+this package (processor_variants.py), which need no compiler. Arguments: kernel_binding.py.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from sim_server.backends.build_pool import CompileError, Job, compilers
+from sim_server.backends.processor_variants import LIBRARIES, made_by, variant
 
 SOURCES = Path(__file__).parents[1]  # sim_server/
 INCLUDE = SOURCES / "kernels"
@@ -49,9 +51,15 @@ def compiler() -> str:
 
 
 @cache
+def compiler_version() -> str:
+    """What the compiler says of itself. Raises CompileError if there is none."""
+    return subprocess.run([compiler(), "--version"], capture_output=True, text=True, check=True).stdout
+
+
+@cache
 def _machine() -> str:
     """What -march=native depends on: compiler version and processor flags."""
-    version = subprocess.run([compiler(), "--version"], capture_output=True, text=True, check=True).stdout
+    version = compiler_version()
     try:
         flags = next(
             line for line in Path("/proc/cpuinfo").read_text().splitlines() if line.startswith(("flags", "Features"))
@@ -106,24 +114,48 @@ def folder_outside(path: str) -> Path | None:
     return None if source.is_relative_to(SOURCES) else source.parent
 
 
+def digest(source: Path, flags: list[str], text: str | None, machine: str) -> str:
+    """Names a library by all that it is made of. machine: compiler, and processor where flags do not name one."""
+    folders = [f for f in {INCLUDE, source.parent, SOURCES / "backends/cpu/native"} if f.is_dir()]
+    headers = sorted(p for folder in folders for p in folder.iterdir() if p.suffix in (".h", ".cuh"))
+    parts = [machine, *flags, text or source.read_text(), *(p.name + p.read_text() for p in headers)]
+    return hashlib.sha256("\0".join(parts).encode()).hexdigest()[:24]
+
+
+def job(source: Path, flags: list[str], text: str | None, library: Path) -> Job:
+    """How a library is made."""
+    own = [] if source.is_relative_to(SOURCES) else [f"-I{source.parent}"]
+    command = [compiler(), *flags, "-x", "c++", f"-I{INCLUDE}", *own, str(source) if text is None else "-"]
+    return Job(source.name, library, command, text)
+
+
+def flags_of(variant: str, defines: tuple[str, ...] = ()) -> list[str]:
+    """Flags of a library of a wheel; it finds the runtime of OpenMP in the folder above it."""
+    generic = [f"-march={variant}" if flag == "-march=native" else flag for flag in FLAGS]
+    return [*generic, "-Wl,--as-needed,-s,-rpath,$ORIGIN/..", *(f"-D{d}" for d in defines)]
+
+
+def _brought(source: Path, defines: tuple[str, ...], text: str | None) -> Path | None:
+    """The library of a text that the wheel brings for this processor; None: it brings none."""
+    if (name := variant()) is None:
+        return None
+    made = digest(source, flags_of(name, defines), text, made_by())
+    library = LIBRARIES / name / f"{source.stem}-{made}.so"
+    return library if library.exists() else None
+
+
 def begin(source: Path, defines: tuple[str, ...] = (), text: str | None = None) -> Path:
-    """The shared library of one text, which exists after `compilers.finish`; compiles only what the cache lacks.
+    """The shared library of one text, which exists after `compilers.finish`; compiles only what is not there.
 
     text: where the file does not hold it. Raises CompileError without a compiler or a folder for the library.
     """
-    folders = [f for f in {INCLUDE, source.parent, SOURCES / "backends/cpu/native"} if f.is_dir()]
-    headers = sorted(p for folder in folders for p in folder.iterdir() if p.suffix in (".h", ".cuh"))
+    if (brought := _brought(source, defines, text)) is not None:
+        return brought
     flags = [*FLAGS, *(f"-D{d}" for d in defines)]
-    digest = hashlib.sha256(
-        "\0".join([_machine(), *flags, text or source.read_text(), *(p.name + p.read_text() for p in headers)]).encode()
-    )
-    library = cache_folder() / f"{source.stem}-{digest.hexdigest()[:24]}.so"
+    library = cache_folder() / f"{source.stem}-{digest(source, flags, text, _machine())}.so"
     if not library.exists():
         _make(library.parent)
-        file = str(source) if text is None else "-"
-        own = [] if source.is_relative_to(SOURCES) else [f"-I{source.parent}"]
-        command = [compiler(), *flags, "-x", "c++", f"-I{INCLUDE}", *own, file]
-        compilers.begin(Job(source.name, library, command, text))
+        compilers.begin(job(source, flags, text, library))
     return library
 
 
@@ -142,8 +174,14 @@ def build(source: Path, stepping: bool = True) -> Path:
     return library
 
 
+def source_of(path: str) -> tuple[Path, str | None]:
+    """File that names a kernel text of this package or of another, and the text where that file does not hold it."""
+    frame, law = _parts(path)
+    return SOURCES / (law or frame), read_text(path)[1] if law else None
+
+
 def begin_kernels(path: str, text: str, defines: tuple[str, ...]) -> Path:
-    """As `begin`, of a kernel text of this package as read_text gives it; notes that this process uses it."""
+    """As `begin`, of a kernel text as read_text gives it; notes that this process uses it."""
     frame, law = _parts(path)
     source = SOURCES / (law or frame)
     library = begin(source, defines, text if law else None)
@@ -158,8 +196,9 @@ def ahead(*paths: str) -> None:
 
 
 def build_id() -> str:
-    """Digest of the compiled code in use: equal ones repeat a run bit for bit."""
-    return hashlib.sha256("\0".join(sorted(libraries)).encode()).hexdigest()[:24]
+    """Digest of the compiled code in use, with the variant of a wheel's: equal ones repeat a run bit for bit."""
+    made = hashlib.sha256("\0".join(sorted(libraries)).encode()).hexdigest()[:24]
+    return f"{name}:{made}" if (name := variant()) else made
 
 
 def native(path: str, signatures: dict[str, tuple[Any, list[Any]]], stepping: bool = True) -> ctypes.CDLL:

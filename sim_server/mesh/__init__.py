@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from protocol.process.extras import missing_extra
 from sim_server.arrays import Float64, Int32
 from sim_server.errors import InputError
 from sim_server.mesh.cells import tetrahedra
@@ -149,9 +150,11 @@ def read(path: str | Path, quadratic: bool = False) -> Mesh:
 
 def meshio_read(path: Path, what: str = "mesh") -> Any:
     """Returns what meshio reads in a file. what: names it in messages. Raises InputError if it cannot be read."""
-    import meshio
-    from meshio._helpers import extension_to_filetypes
-
+    try:
+        import meshio
+        from meshio._helpers import extension_to_filetypes
+    except ModuleNotFoundError as error:
+        raise InputError(f"{what} {path}: {missing_extra(error) or error}") from error
     formats = f"formats by extension: {' '.join(sorted(extension_to_filetypes))}"
     said = io.StringIO()  # meshio prints its reasons, and ends the process where it cannot read a file
     try:

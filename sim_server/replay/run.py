@@ -23,6 +23,7 @@ from protocol.log_chunks import BadLog
 from protocol.refused import Refused
 from protocol.validate import array, check_range, checksum
 from sim_server.arrays import Float64
+from sim_server.backends.processor_variants import advice
 from sim_server.checkpoint.content import SavedFactors, restore, saved_factors
 from sim_server.checkpoint.file import from_bytes
 from sim_server.errors import DeviceError, InputError
@@ -107,6 +108,7 @@ class Replay:
         if code.build_id(self.simulation) != recording.scene.build and recording.scene.build:
             self.compared.notes.append(
                 "another build than the recorded one (kernels, compiler, processor or GPU): last digits may differ"
+                + advice(recording.scene.build)
             )
 
     def _resume(self, recording: Recording) -> None:

@@ -5,9 +5,10 @@
 others.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from os.path import exists
 from pathlib import Path
+from typing import Any
 
 from pydantic import ValidationError
 
@@ -17,7 +18,7 @@ from sim_server.scene.messages import readable
 from sim_server.scene.model import Scene, SceneObject
 from sim_server.scene.overrides import Place, apply
 
-__all__ = ["Scene", "SceneObject", "load"]
+__all__ = ["Scene", "SceneObject", "load", "validated"]
 
 
 def load(path: str | Path, overrides: Sequence[str] = ()) -> Scene:
@@ -41,9 +42,17 @@ def load(path: str | Path, overrides: Sequence[str] = ()) -> Scene:
                 overlays[apply(override, table)] = ""
         except InputError as error:
             raise InputError(f"scene {path.name}, {error}") from None
-    try:
-        scene = Scene.model_validate({"name": path.stem, **table}, context={"folder": path.parent})
-    except ValidationError as error:
-        raise readable(error, path.name, table, overlays) from None
+    scene = validated({"name": path.stem, **table}, path.name, path.parent, overlays)
     scene._path, scene._text = gallery.name_of(path), text
     return scene
+
+
+def validated(table: dict[str, Any], where: str, folder: Path, overlays: Mapping[Place, str] | None = None) -> Scene:
+    """Returns the scene of a table. where: names it in messages; folder: of the files that it names.
+
+    overlays: files that values are from, by their places. Raises InputError with one line for each error.
+    """
+    try:
+        return Scene.model_validate({"name": "scene", **table}, context={"folder": folder})
+    except ValidationError as error:
+        raise readable(error, where, table, overlays) from None

@@ -3,6 +3,7 @@
 
 from dataclasses import replace
 from functools import partial
+from hashlib import sha256
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -39,7 +40,7 @@ if TYPE_CHECKING:
 
 
 class MeshSource(Parameters):
-    """Source of a mesh: { bar = cells, size = m } or { file = path }."""
+    """Source of a mesh: { bar = cells, size = m } or { file = path }; of one given from Python its digest."""
 
     bar: Counts | None = Field(default=None, description="cells along x, y, z; each is split into 6 tetrahedra")
     size: Sizes | None = Field(default=None, description="size of the bar along x, y, z [m]")
@@ -51,6 +52,15 @@ class MeshSource(Parameters):
         default=None, description="scale of the coordinates in a file: 0.001 for a mesh in mm"
     )
     file: File | None = Field(default=None, description="a file that meshio reads")
+    arrays: str | None = Field(default=None, description="digest of a mesh that a program gives; not for scene files")
+
+    @model_validator(mode="before")
+    @classmethod
+    def _of_a_program(cls, table: Any) -> Any:
+        """Names a mesh that a program gives; the object gets it by `use_mesh`."""
+        if isinstance(table, Mesh):
+            return {"arrays": sha256(table.rest.tobytes() + table.tets.tobytes()).hexdigest()[:24]}
+        return table
 
     @model_validator(mode="before")
     @classmethod
@@ -62,12 +72,12 @@ class MeshSource(Parameters):
 
     @model_validator(mode="after")
     def _one_source(self) -> "MeshSource":
-        given = [name for name in ("bar", "size", "file") if getattr(self, name) is not None]
+        given = [name for name in ("bar", "size", "file", "arrays") if getattr(self, name) is not None]
         if self.split is not None and self.bar is None:
             raise complaint("split belongs to a bar")
         if self.scale is not None and self.file is None:
             raise complaint("scale belongs to a file; a bar has its size in m")
-        if given not in (["bar", "size"], ["file"]):
+        if given not in (["bar", "size"], ["file"], ["arrays"]):
             raise complaint(f"must be {{ bar = [nx, ny, nz], size = [sx, sy, sz] }} or {{ file = ... }}, not {given}")
         return self
 
@@ -136,6 +146,11 @@ class SceneObject(Parameters):
         if self._given is not None:
             return self._given
         source = self.mesh
+        if source.arrays is not None:
+            raise InputError(
+                f"object {self.name!r}: mesh.arrays = {source.arrays!r}: a mesh that a program gives; "
+                "a scene file has bar or file"
+            )
         try:
             if source.file is not None:
                 mesh = read(source.file, self._keeps_mid_nodes)

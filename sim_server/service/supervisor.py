@@ -9,11 +9,11 @@ all, and kill them.
 import logging
 import os
 import subprocess
-import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
 
 from protocol.messages_pb2 import LocalWorker
+from protocol.process.own_python import own_module
 
 log = logging.getLogger(__name__)
 
@@ -64,10 +64,10 @@ class Supervisor:
         clock: Callable[[], float] = time.monotonic, start: Start = worker_process,
     ):  # fmt: skip
         endpoints = [word for endpoint in connect for word in ("--connect", endpoint)]
-        self._command = [
-            sys.executable, "-m", "precond_worker", "--exit-with-parent", "--parent", str(os.getpid()),
-            "--server", server, *endpoints, *arguments,
-        ]  # fmt: skip
+        self._command = own_module(
+            "precond_worker", "--exit-with-parent", "--parent", str(os.getpid()), "--server", server, *endpoints,
+            *arguments,
+        )  # fmt: skip
         self._clock, self._popen = clock, start
         self.workers = [_Process(f"local-{i + 1}") for i in range(count)]
         for worker in self.workers:

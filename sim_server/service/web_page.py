@@ -4,7 +4,6 @@
 import logging
 import os
 import subprocess
-import sys
 import time
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -12,6 +11,7 @@ from typing import Any
 from typer.core import TyperCommand
 
 from protocol.network.web_address import HOST, PORT, shown, web_address
+from protocol.process.own_python import own_module
 from protocol.refused import Refused
 
 log = logging.getLogger(__name__)
@@ -57,10 +57,10 @@ class WebPage:
         self, server: str, connect: str, host: str, port: int, quiet: bool = False,
         clock: Callable[[], float] = time.monotonic, start: Start | None = None,
     ):  # fmt: skip
-        self._command = [
-            sys.executable, "-m", "clients", "web", "--exit-with-parent", "--parent", str(os.getpid()),
+        self._command = own_module(
+            "clients", "web", "--exit-with-parent", "--parent", str(os.getpid()),
             "--server", server, "--connect", connect, "--host", host, "--port", str(port),
-        ]  # fmt: skip
+        )  # fmt: skip
         output = subprocess.DEVNULL if quiet else None
         self._clock = clock
         self._start = start or (lambda command: subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=output))

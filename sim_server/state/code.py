@@ -20,4 +20,7 @@ def codes(simulation: Simulation) -> "list[Code]":
 def build_id(simulation: Simulation) -> str:
     """Returns a digest of what a run depends on beside its scene: equal ones repeat it bit for bit."""
     built, others = simulation.world.backend.build(), codes(simulation)
-    return hashlib.sha256("\0".join([built, *map(str, others)]).encode()).hexdigest()[:24] if others else built
+    if not others:
+        return built
+    variant, mark, _ = built.rpartition(":")
+    return variant + mark + hashlib.sha256("\0".join([built, *map(str, others)]).encode()).hexdigest()[:24]

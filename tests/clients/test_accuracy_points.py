@@ -667,7 +667,8 @@ def test_the_page_opens_alone_and_escapes_what_it_shows(tmp_path: Path) -> None:
 def test_without_plotly_the_rest_is_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "plotly", None)
     missing = write(sample(), tmp_path)
-    assert len(missing) == 1 and missing[0].startswith("accuracy.html is not written: plotly is not installed: ")
+    (why,) = missing
+    assert why.startswith("accuracy.html is not written: plotly is not installed, of the extra view: ")
     assert (tmp_path / "accuracy.png").read_bytes().startswith(b"\x89PNG")
     assert (tmp_path / "points.csv").read_text().startswith("axis,settings,status")
     assert not (tmp_path / "accuracy.html").exists()

@@ -10,6 +10,7 @@ import typer.main
 from typer.core import TyperGroup, TyperOption
 
 from clients.__main__ import app as client
+from clients.demo.command import app as face
 from precond_worker.cli import app as worker
 from sim_server.cli import app as server
 from tests.docs.figures import DOCS, ROOT, table_under, texts
@@ -51,6 +52,7 @@ PROGRAMS = {
     "precond-worker": typer.main.get_command(worker),
     "deploy/launch.py SCENE.toml": typer.main.get_command(_launch()),
 }
+GROUPS = {"sim-client COMMAND": typer.main.get_command(client), "warpfactor COMMAND": typer.main.get_command(face)}
 
 
 @pytest.mark.parametrize("heading", PROGRAMS)
@@ -76,19 +78,20 @@ def test_options_of_a_program(heading: str) -> None:
             assert f"at most {largest:g}" in row["meaning"], names
 
 
-def _commands() -> dict[str, str]:
+def _commands(heading: str) -> dict[str, str]:
     """Command: what its row says of its options."""
     return {
         name: row["its options (default)"]
-        for row in table_under(TEXT, "sim-client COMMAND")
+        for row in table_under(TEXT, heading)
         for name in re.findall(r"`([a-z-]+)[^`]*`", row["command"])
     }
 
 
-def test_commands_of_the_client() -> None:
-    group = typer.main.get_command(client)
+@pytest.mark.parametrize("heading", GROUPS)
+def test_commands_of_a_program(heading: str) -> None:
+    group = GROUPS[heading]
     assert isinstance(group, TyperGroup)
-    said = _commands()
+    said = _commands(heading)
     assert set(said) == set(group.commands)
     for name, command in group.commands.items():
         own = {o.opts[0]: o for o in _options(command)}

@@ -28,7 +28,7 @@ DEFINED = {
 }
 
 
-FOLDERS = ("protocol", "sim_server", "precond_worker", "clients", "deploy", "docs", "tests")
+FOLDERS = ("warpfactor", "protocol", "sim_server", "precond_worker", "clients", "deploy", "docs", "tests")
 
 
 @cache
@@ -116,7 +116,7 @@ def test_python_names_what_is_there(name: str, code: str) -> None:
 
 
 def test_python_of_a_run_without_a_network(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    code = next(code for name, code in blocks("python") if name == "use.md" and "Simulation.load" in code)
+    code = next(code for name, code in blocks("python") if name == "use.md" and "wf.Simulation(scene)" in code)
     monkeypatch.chdir(ROOT)
     exec(compile(code, "use.md", "exec"), {})
     assert capsys.readouterr().out

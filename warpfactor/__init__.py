@@ -1,0 +1,46 @@
+# SPDX-License-Identifier: MIT
+"""Soft bodies in real time, from Python: `import warpfactor as wf`.
+
+wf.Simulation, wf.Scene, wf.Mesh   simulate in this process; they need the extra server
+wf.Client                          a server that runs: push, grab, watch, steer
+wf.Log                             what a run has recorded
+
+Names are imported when they are first used, so that a client needs no more than a client.
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+from protocol.process.extras import missing_extra
+
+if TYPE_CHECKING:
+    from clients.client import Client
+    from clients.log.reader import Log
+    from sim_server.embedded import Mesh, Scene, Simulation
+
+__all__ = ["Client", "Log", "Mesh", "Scene", "Simulation"]
+
+_PLACES = {
+    "Client": "clients.client",
+    "Log": "clients.log.reader",
+    "Mesh": "sim_server.embedded",
+    "Scene": "sim_server.embedded",
+    "Simulation": "sim_server.embedded",
+}
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _PLACES:
+        raise AttributeError(f"module 'warpfactor' has no attribute {name!r}; there is {', '.join(__all__)}")
+    try:
+        found = getattr(import_module(_PLACES[name]), name)
+    except ModuleNotFoundError as error:
+        if advice := missing_extra(error):
+            raise ModuleNotFoundError(f"warpfactor.{name}: {advice}", name=error.name) from error
+        raise
+    globals()[name] = found
+    return found
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})
