@@ -254,6 +254,24 @@ def _show_parameters(found: list[pb.LiveParameter], as_json: bool) -> None:
     Console().print(parameter_table(found))
 
 
+@app.command()
+def materials(
+    name: Annotated[str | None, typer.Argument(metavar="[NAME]", help="Only this one, with its sources.")] = None,
+    as_json: Json = False,
+) -> None:
+    """List the materials that an object of a scene may name, or show one: law, constants, range, sources.
+
+    \b
+    Examples:
+      sim-client materials
+      sim-client materials liver
+      sim-client materials ecoflex_00_30 --json | jq .typical
+    """
+    from clients.materials.show import show
+
+    show(name, as_json)
+
+
 @app.command("move-obstacle")
 def move_obstacle(
     name: Annotated[str, typer.Argument(metavar="NAME", help='Obstacle or holder with moved = "client".')],

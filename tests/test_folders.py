@@ -12,6 +12,7 @@ MOST_FILES = 12  # of a folder of theirs, without __init__.py
 PRIVATE_NAMES = 15  # that tests may use, fewer than
 ALLOWED = {  # what each folder imports of its package
     "protocol.network": {"channels", "process", "refused", "shared_memory"},
+    "protocol.materials": set(),
     "protocol.process": set(),
     "protocol.shared_memory": {"channels", "refused", "validate"},
     "precond_worker.symbolic": {"arrays"},
@@ -22,6 +23,7 @@ ALLOWED = {  # what each folder imports of its package
     "clients.demo": {"client", "errors", "load_test", "log"},
     "clients.haptics": {"client", "errors", "obstacle"},
     "clients.log": {"errors"},
+    "clients.materials": {"errors"},
     "clients.web": {"client", "errors", "log", "viewer"},
     "clients.viewer": {"client", "errors", "log", "progress"},
     "clients.replay": {"errors", "log", "progress"},

@@ -29,6 +29,7 @@ from sim_server.scene.halving import check_halving
 from sim_server.scene.holders import Holder, check_holders_on, holder_errors
 from sim_server.scene.integrator_options import IntegratorOptions
 from sim_server.scene.live import Live
+from sim_server.scene.materials import Material, with_material
 from sim_server.scene.obstacles import FRICTION, Obstacle, check_contact_on, contact_errors
 from sim_server.scene.parameters import Count, Counts, File, Name, NotNegative, Parameters, Positive, Sizes, complaint
 from sim_server.scene.pose import Pose
@@ -104,7 +105,12 @@ class SceneObject(Parameters):
         default=None, description="a finer surface that moves with the mesh, for viewers; a file that meshio reads"
     )
     pose: Pose = Pose()
-    density: Positive | None = Field(default=None, description="[kg/m3]; 1000 if neither density nor mass is given")
+    material: str | Material | None = Field(
+        default=None, description="by name: sets density and law, and is not there when the scene is resolved"
+    )
+    density: Positive | None = Field(
+        default=None, description="[kg/m3]; 1000 if neither density, mass nor material is given"
+    )
     mass: Positive | None = Field(default=None, description="of the whole object, instead of density [kg]")
     masses: Literal["volume", "equal"] = Field(
         default="volume", description="nodal masses: a quarter of each adjacent element, or the same for every node"
@@ -130,8 +136,12 @@ class SceneObject(Parameters):
 
     @model_validator(mode="before")
     @classmethod
-    def _water_by_default(cls, table: Any) -> Any:
-        if isinstance(table, dict) and table.get("density") is None and table.get("mass") is None:
+    def _of_its_material(cls, table: Any) -> Any:
+        """Fills in what a material sets; without one, and without density and mass, an object has that of water."""
+        if not isinstance(table, dict):
+            return table
+        table = with_material(table)
+        if table.get("density") is None and table.get("mass") is None:
             return {**table, "density": 1000.0}
         return table
 

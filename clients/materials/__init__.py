@@ -1,0 +1,2 @@
+# SPDX-License-Identifier: MIT
+"""Materials by name on a terminal."""
