@@ -72,6 +72,9 @@ def topology(simulation: Simulation, body: Body) -> pb.Topology:
         message.reference = _bytes(body.mesh.rest, "<f8")
     if body.mesh.quadratic is not None:
         message.quadratic = _bytes(body.mesh.quadratic, "<i4")
+    for name, group in body.mesh.groups.items():
+        parts = (_bytes(part, "<i4") for part in (group.elements, group.faces, group.nodes))
+        message.groups.append(pb.Group(**dict(zip(("elements", "faces", "nodes"), parts, strict=True)), name=name))
     if body.skin is not None:
         message.skin_nodes, message.skin_weights = _bytes(body.skin.nodes, "<i4"), _bytes(body.skin.weights, "<f8")
         message.skin_triangles = _bytes(body.skin.triangles, "<i4")

@@ -12,12 +12,14 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
+from protocol.messages_pb2 import Group as GroupMessage
 from protocol.messages_pb2 import Scene as SceneMessage
 from protocol.messages_pb2 import Topology
 from protocol.refused import Refused
 from protocol.validate import all_finite, array, check_range
 from sim_server.errors import InputError
 from sim_server.mesh import Mesh, check
+from sim_server.mesh.groups import Group
 from sim_server.scene.model import Scene
 from sim_server.simulation import Simulation
 
@@ -103,4 +105,15 @@ def _mesh(topology: Topology) -> Mesh:
     if topology.quadratic:
         quadratic = array(topology.quadratic, np.int32, (-1, 10), "Topology.quadratic")
         check_range(quadratic, 0, topology.nodes, "Topology.quadratic")
-    return check(Mesh(rest, tets, topology.header.object, quadratic=quadratic))
+    groups = {group.name: _group(group, len(tets), topology.nodes) for group in topology.groups}
+    return check(Mesh(rest, tets, topology.header.object, quadratic=quadratic, groups=groups))
+
+
+def _group(given: GroupMessage, tets: int, nodes: int) -> Group:
+    elements = array(given.elements, np.int32, (-1,), "Group.elements")
+    faces = array(given.faces, np.int32, (-1, 4), "Group.faces")
+    others = array(given.nodes, np.int32, (-1,), "Group.nodes")
+    check_range(elements, 0, tets, "Group.elements")
+    check_range(faces, 0, nodes, "Group.faces")
+    check_range(others, 0, nodes, "Group.nodes")
+    return Group(elements, faces, others)
