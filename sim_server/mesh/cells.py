@@ -54,7 +54,7 @@ def tetrahedra(rest: Float64, blocks: Sequence[Any]) -> tuple[Int64, list[str]]:
     tets = [cells.pop("tetra")]
     for shape, corners in cells.items():
         if len(corners):
-            tets.append(_split(rest, shape, corners))
+            tets.append(split(rest, shape, corners))
             said.append(f"{len(corners)} {shape} cells split into {len(tets[-1])} tetrahedra")
     _check_diagonals(np.concatenate(tets), cells)
     return np.concatenate(tets), said
@@ -75,8 +75,8 @@ def _corners(shape: str, blocks: Sequence[Any]) -> Int64:
     return np.concatenate([np.empty((0, count), np.int64), *parts]).astype(np.int64)
 
 
-def _split(rest: Float64, shape: str, corners: Int64) -> Int64:
-    """Splits the cells (m, c) into tetrahedra of positive volume, (k m, 4), k per cell."""
+def split(rest: Float64, shape: str, corners: Int64) -> Int64:
+    """Splits cells (m, c) of a shape, not tetra, into tetrahedra of positive volume, (k m, 4), k per cell."""
     if ((corners < 0) | (corners >= len(rest))).any():
         bad = int(np.flatnonzero(((corners < 0) | (corners >= len(rest))).any(axis=1))[0])
         raise InputError(f"{shape} {bad} has nodes {corners[bad].tolist()}: must be 0 to {len(rest) - 1}")

@@ -27,6 +27,7 @@ from sim_server.checkpoint.content import SavedFactors, restore, saved_factors
 from sim_server.checkpoint.file import from_bytes
 from sim_server.errors import DeviceError, InputError
 from sim_server.mechanics.world import Body
+from sim_server.mesh.arrays import packed
 from sim_server.recording import messages
 from sim_server.recording.obstacles import obstacle_messages, targets_of
 from sim_server.replay.log import Recording
@@ -37,7 +38,7 @@ from sim_server.simulation import Simulation
 from sim_server.state import code
 from sim_server.state.start import Start
 from sim_server.updates.factor_source import Inline, Job
-from sim_server.updates.worker_assembly import Assembly
+from sim_server.updates.worker_assembly import Assembly, mesh_of_topology
 
 if TYPE_CHECKING:
     from sim_server.effects.touch import Interaction
@@ -57,6 +58,7 @@ class Replay:
                 recording.notes.append(
                     'recorded with warp = "auto", repeated with true: steps that were tried without may differ'
                 )
+            self._meshes_of_surfaces(table)
             scene, watched = Scene.model_validate(table), "on_runaway" in table.get("solver", {})
         except ValidationError as error:
             reason, software = str(readable(error, f"in {recording.path.name}", table)), recording.scene.software
@@ -160,6 +162,15 @@ class Replay:
             for step, both in enumerate(self._taken[body.name].tolist(), self.recording.first):
                 uses |= {(body.name, made): step for made in both if made >= 0}
         return uses
+
+    def _meshes_of_surfaces(self, table: dict[str, Any]) -> None:
+        """Takes meshes that were made by filling a surface from the log, which needs neither surface nor mesher."""
+        for o in table["object"] if isinstance(table.get("object"), list) else ():
+            if not isinstance(o, dict) or not isinstance(o.get("mesh"), dict) or "surface" not in o["mesh"]:
+                continue
+            recorded = self.recording.objects.get(str(o.get("name")))
+            if recorded is not None and recorded.topology is not None:
+                o["mesh"] = {"data": packed(mesh_of_topology(recorded.topology))}
 
     def _same_meshes(self) -> None:
         if [b.name for b in self.bodies] != list(self.recording.scene.objects):

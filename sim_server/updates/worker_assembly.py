@@ -38,7 +38,7 @@ class Assembly:
     def __init__(self, scene: SceneMessage, topology: Topology):
         name = topology.header.object
         try:
-            self._simulation = Simulation(single_object_scene(scene.resolved, name, _mesh(topology)))
+            self._simulation = Simulation(single_object_scene(scene.resolved, name, mesh_of_topology(topology)))
         except (InputError, ValidationError) as error:
             raise Refused(f"Scene.resolved, object {name!r}: {error}", "malformed") from error
         self._simulation.engine.begin = ()  # A of a scheme of several steps does not depend on the states before
@@ -97,7 +97,8 @@ def single_object_scene(resolved: str, name: str, mesh: Mesh) -> Scene:
     return scene
 
 
-def _mesh(topology: Topology) -> Mesh:
+def mesh_of_topology(topology: Topology) -> Mesh:
+    """Returns the mesh of an object, before its pose. Raises Refused, InputError."""
     rest = array(topology.reference or topology.rest, np.float64, (topology.nodes, 3), "Topology.rest", finite=True)
     tets = array(topology.tets, np.int32, (-1, 4), "Topology.tets")
     check_range(tets, 0, topology.nodes, "Topology.tets")
