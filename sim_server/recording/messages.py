@@ -53,6 +53,20 @@ def scene(simulation: Simulation) -> pb.Scene:
     )
 
 
+def published(message: pb.Scene) -> pb.Scene:
+    """Returns a scene as the network has it: texts of meshes are left out, since topologies hold these meshes."""
+    table = json.loads(message.resolved)
+    large = [o["mesh"] for o in table["object"] if "data" in o["mesh"]]
+    if not large:
+        return message
+    for mesh in large:
+        mesh["data"] = ""
+    sent = pb.Scene()
+    sent.CopyFrom(message)
+    sent.resolved = json.dumps(table)
+    return sent
+
+
 def topology(simulation: Simulation, body: Body) -> pb.Topology:
     """Converts mesh and block pattern of one object, epoch 1."""
     pose = simulation.scene.objects[body.index].pose

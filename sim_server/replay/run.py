@@ -27,7 +27,6 @@ from sim_server.checkpoint.content import SavedFactors, restore, saved_factors
 from sim_server.checkpoint.file import from_bytes
 from sim_server.errors import DeviceError, InputError
 from sim_server.mechanics.world import Body
-from sim_server.mesh.arrays import packed
 from sim_server.recording import messages
 from sim_server.recording.obstacles import obstacle_messages, targets_of
 from sim_server.replay.log import Recording
@@ -58,8 +57,7 @@ class Replay:
                 recording.notes.append(
                     'recorded with warp = "auto", repeated with true: steps that were tried without may differ'
                 )
-            self._meshes_of_surfaces(table)
-            scene, watched = Scene.model_validate(table), "on_runaway" in table.get("solver", {})
+            scene, watched = self._scene(table), "on_runaway" in table.get("solver", {})
         except ValidationError as error:
             reason, software = str(readable(error, f"in {recording.path.name}", table)), recording.scene.software
             reason += f"; recorded with {software}" if " effect " in software else ""
@@ -163,14 +161,18 @@ class Replay:
                 uses |= {(body.name, made): step for made in both if made >= 0}
         return uses
 
-    def _meshes_of_surfaces(self, table: dict[str, Any]) -> None:
-        """Takes meshes that were made by filling a surface from the log, which needs neither surface nor mesher."""
-        for o in table["object"] if isinstance(table.get("object"), list) else ():
-            if not isinstance(o, dict) or not isinstance(o.get("mesh"), dict) or "surface" not in o["mesh"]:
-                continue
-            recorded = self.recording.objects.get(str(o.get("name")))
-            if recorded is not None and recorded.topology is not None:
-                o["mesh"] = {"data": packed(mesh_of_topology(recorded.topology))}
+    def _scene(self, table: dict[str, Any]) -> Scene:
+        """Returns the validated scene of the log; meshes that were made by filling a surface are those of the log, so
+        neither surface nor mesher is needed."""
+        listed = table["object"] if isinstance(table.get("object"), list) else []
+        meshes = [o.get("mesh") for o in listed if isinstance(o, dict)]
+        filled = any(isinstance(mesh, dict) and mesh.get("surface") for mesh in meshes)
+        scene = Scene.model_validate(table, context={"files": "known"} if filled else None)
+        for o in scene.objects if filled else ():
+            recorded = self.recording.objects.get(o.name)
+            if o.mesh.surface is not None and recorded is not None and recorded.topology is not None:
+                o.use_mesh(mesh_of_topology(recorded.topology))
+        return scene
 
     def _same_meshes(self) -> None:
         if [b.name for b in self.bodies] != list(self.recording.scene.objects):

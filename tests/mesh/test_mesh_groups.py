@@ -180,6 +180,29 @@ def test_a_scene_names_groups_of_elements_and_nodes(organ):
     np.testing.assert_allclose(assembly.matrix(sim.world.x.copy()), sim.system.values, rtol=1e-12)
 
 
+def test_all_that_names_nodes_knows_groups(organ):
+    """Holders, attachments, springs to a target, drained nodes, loads and membranes; also in lists of tables."""
+    effects = """
+target = { to = ["X", "Y", "Z"], stiffness = 1, group = "rest" }
+traction = [{ group = "ligament", force = [0, 0, 3] }, { group = "tumour", where = "Z > 0.99", pressure = 1 }]
+poroelasticity = { mobility = 1e-9, storage = 1e5, drained = { group = "ligament" } }
+membrane = { young = 1e5, poisson = 0.3, thickness = 1e-3, group = "ligament" }
+[[holder]]
+name = "clamp"
+object = "liver"
+group = "ligament"
+"""
+    (organ / "all.toml").write_text(SCENE.replace('fixed = { group = "ligament", where = "Y < 0.5" }', effects))
+    scene = load(organ / "all.toml")
+    sim = Simulation(scene)
+    assert np.array_equal(sim.world.held > 0, AT_END)
+    assert np.array_equal(sim.effects["target"].stiffness > 0, BOX.rest[:, 0] >= 2)
+    assert len(sim.effects["membrane"].elements) == len(END)
+    first, second = scene.objects[0].effects["traction"].tables
+    assert (first.where, second.where) == ('group("ligament")', 'group("tumour") and (Z > 0.99)')
+    assert scene.holders[0].where == first.where and scene.holders[0].name == "clamp"
+
+
 def test_one_region_is_set_by_its_name(organ):
     at_start = load(organ / "scene.toml", ["object.liver.effects.corotational.young[tumour]=3e4"])
     sim = Simulation(at_start)

@@ -18,6 +18,7 @@ from sim_server.replay.log import Recording
 from sim_server.replay.run import Replay
 from sim_server.scene import Scene, load, where
 from sim_server.simulation import Simulation
+from sim_server.updates.worker_assembly import Assembly
 
 BOX = bar([3, 1, 1], [3.0, 1.0, 1.0])
 LEFT, AT_END = BOX.centroids[:, 0] < 1.5, BOX.rest[:, 0] == 0
@@ -61,6 +62,11 @@ def test_a_scene_of_arrays_is_logged_and_repeated_to_the_bit(tmp_path):
     sim = Simulation(scene)
     assert np.array_equal(sim.effects["corotational"].elastic[0][0], np.where(LEFT, 2e4, 1e4))
     assert np.array_equal(sim.world.free == 0, AT_END)
+    sent, topology = messages.published(messages.scene(sim)), messages.topology(sim, sim.world.bodies[0])
+    assert len(sent.resolved) < len(messages.scene(sim).resolved) - 200  # the topology has the mesh
+    sim.engine.assemble()
+    same = Assembly(sent, topology).matrix(sim.world.x.copy())
+    assert same.tobytes() == sim.system.values.tobytes()
     record(sim, tmp_path / "run.mcap")
     repeat(tmp_path / "run.mcap")
 
