@@ -108,7 +108,7 @@ def _group(mesh: Mesh, key: str, given: Any) -> Group:
     count = {"elements": len(cells), "faces": len(mesh.rest), "nodes": len(mesh.rest)}
     parts = {part: _indices(value, part, count[part], key, mesh.name) for part, value in table.items()}
     if mesh.quadratic is not None and "elements" in parts:
-        parts["elements"] = (8 * parts["elements"][:, None] + np.arange(8, dtype=np.int32)).ravel()
+        parts["elements"] = (8 * parts["elements"][:, None] + np.arange(8)).ravel().astype(np.int32)
     return Group(**parts)
 
 

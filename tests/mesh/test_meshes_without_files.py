@@ -80,6 +80,8 @@ def test_a_mesh_stands_for_itself_and_its_text_keeps_all_of_it():
         for name in mesh.groups:
             assert np.array_equal(again.nodes_of(name), mesh.nodes_of(name))
     assert again.quadratic is not None and np.array_equal(again.elements_of("tumour"), np.repeat(LEFT, 8))
+    given = mesh_of(again.rest, again.quadratic, {"tumour": LEFT})
+    assert np.array_equal(given.tets, again.tets) and np.array_equal(given.elements_of("tumour"), np.repeat(LEFT, 8))
 
 
 def test_lists_in_a_scene_file_are_arrays(tmp_path):
