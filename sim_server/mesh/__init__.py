@@ -163,7 +163,10 @@ def read(path: str | Path, quadratic: bool = False) -> Mesh:
     if changed:
         log.warning("mesh %s: %s", path, "; ".join(changed))
     numbers = np.where(used, np.cumsum(used) - 1, -1)
-    groups = read_groups(data, numbers, bool(kept))
+    try:
+        groups = read_groups(data, numbers, bool(kept))
+    except (IndexError, ValueError, TypeError) as error:
+        raise InputError(f"mesh {path}: its groups cannot be read ({error})") from error
     rest, numbered = rest[used], numbers[cells].astype(np.int32)
     if kept:
         return Mesh(rest, sub_tetrahedra(rest, numbered), path.name, dropped, numbered, groups)

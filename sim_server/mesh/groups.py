@@ -20,6 +20,7 @@ from sim_server.mesh.quadratic import EDGES
 
 TAGS = ("gmsh:physical", "medit:ref", "tetgen:ref")  # numbers of cells by which files tell groups
 NAMED = 40  # groups named in a message
+MOST_NUMBERS = 100  # more numbers without names are no groups: they count something
 PAIRS = ((0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3))
 Mask = NDArray[np.bool_]
 
@@ -76,31 +77,38 @@ def read_groups(data: Any, numbers: Int64, eightfold: bool) -> dict[str, Group]:
     numbers: number of each node of the file in the mesh, -1 where it was dropped
     eightfold: elements are quadratic, of eight tetrahedra each; else as `cells.tetrahedra` makes them
     """
-    return {
-        name: _group(data.cells, masks, points, numbers, eightfold)
-        for name, (masks, points) in sorted(_members(data).items())
-    }
+    return {name: _group(data.cells, members, numbers, eightfold) for name, members in sorted(_members(data).items())}
 
 
-def _members(data: Any) -> dict[str, tuple[list[Mask], list[Int64]]]:
-    """Returns the members of each group: of each block of cells which ones, and numbers of points."""
-    found: dict[str, tuple[list[Mask], list[Int64]]] = {}
+@dataclass
+class _Members:
+    """Members of a group in a file: which cells of each block (by its number) are, and numbers of points."""
 
-    def of(name: str) -> tuple[list[Mask], list[Int64]]:
-        return found.setdefault(name, ([np.zeros(len(b.data), bool) for b in data.cells], []))
+    cells: dict[int, Mask] = field(default_factory=dict)
+    points: list[Int64] = field(default_factory=list)
 
+    def add(self, number: int, block: Any, chosen: Any) -> None:
+        """Adds cells of a block, by their numbers or a mask."""
+        self.cells.setdefault(number, np.zeros(len(block.data), bool))[chosen] = True
+
+
+def _members(data: Any) -> dict[str, _Members]:
     names = {(int(dim), int(tag)): name for name, (tag, dim) in _physical(data)}
-    for name in names.values():
-        of(name)
+    found = {name: _Members() for name in names.values()}
     for key in TAGS:
-        for k, (block, tags) in enumerate(zip(data.cells, data.cell_data.get(key, ()), strict=False)):
-            for tag in np.unique(tags)[np.unique(tags) != 0].tolist() if len(tags) == len(block.data) else ():
-                of(names.get((block.dim, int(tag)), str(int(tag))))[0][k][np.asarray(tags) == tag] = True
+        tagged = list(zip(data.cells, map(np.asarray, data.cell_data.get(key, ())), strict=False))
+        values = np.unique(np.concatenate([tags for _, tags in tagged])) if tagged else np.zeros(0)
+        numbers = np.setdiff1d(values, [0]).tolist()
+        for k, (block, tags) in enumerate(tagged):
+            for tag in numbers:
+                name = names.get((block.dim, int(tag)), str(int(tag)) if len(numbers) <= MOST_NUMBERS else "")
+                if name and len(tags) == len(block.data) and (chosen := tags == tag).any():
+                    found.setdefault(name, _Members()).add(k, block, chosen)
     for name, parts in data.cell_sets.items():
         if not name.startswith("gmsh:"):
-            _mark(of(name)[0], parts)
+            _add_set(found.setdefault(name, _Members()), data.cells, parts)
     for name, points in data.point_sets.items():
-        of(name)[1].append(np.asarray(points, np.int64).ravel())
+        found.setdefault(name, _Members()).points.append(np.asarray(points, np.int64).ravel())
     return found
 
 
@@ -108,25 +116,24 @@ def _physical(data: Any) -> list[tuple[str, Any]]:
     return [(name, value) for name, value in data.field_data.items() if np.shape(value) == (2,)]
 
 
-def _mark(masks: list[Mask], parts: Sequence[Any]) -> None:
-    """Marks cells by their numbers in each block. parts: of each block, None for none; or lists of such, of sets that
-    are made of others."""
+def _add_set(members: _Members, blocks: Sequence[Any], parts: Sequence[Any]) -> None:
+    """Adds a set of cells. parts: numbers in each block, None for none; or lists of such, of sets made of others."""
     if any(isinstance(part, list) and any(np.ndim(p) for p in part) for part in parts):
         for part in parts:
-            _mark(masks, part)
+            _add_set(members, blocks, part)
         return
-    for mask, part in zip(masks, parts, strict=False):
+    for k, (block, part) in enumerate(zip(blocks, parts, strict=False)):
         if part is not None and np.size(part):
-            mask[np.asarray(part, np.int64)] = True
+            members.add(k, block, np.asarray(part, np.int64))
 
 
-def _group(
-    blocks: Sequence[Any], masks: Sequence[Mask], points: Sequence[Int64], numbers: Int64, eightfold: bool
-) -> Group:  # fmt: skip
-    chosen = np.concatenate([m for b, m in zip(blocks, masks, strict=True) if b.dim == 3]) if eightfold else (
-        per_tetrahedron(blocks, masks))  # fmt: skip
+def _group(blocks: Sequence[Any], members: _Members, numbers: Int64, eightfold: bool) -> Group:
+    masks = [members.cells.get(k, np.zeros(len(block.data), bool)) for k, block in enumerate(blocks)]
+    chosen = per_tetrahedron(blocks, masks)
+    if eightfold:
+        chosen = np.concatenate([mask for block, mask in zip(blocks, masks, strict=True) if block.dim == 3])
     elements = np.flatnonzero(np.repeat(chosen, 8) if eightfold else chosen)
-    faces, nodes = [np.zeros((0, 4), np.int64)], [*points, np.zeros(0, np.int64)]
+    faces, nodes = [np.zeros((0, 4), np.int64)], [*members.points, np.zeros(0, np.int64)]
     for block, mask in zip(blocks, masks, strict=True):
         if block.dim == 3 or not mask.any():
             continue

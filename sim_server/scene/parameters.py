@@ -67,7 +67,7 @@ def _with_group(cls: type[Parameters], table: Any) -> Any:
         error = InitErrorDetails(type=complaint("must be the name of a group"), loc=("group",), input=table["group"])
         raise ValidationError.from_exception_data(cls.__name__, [error])
     rest = {key: value for key, value in table.items() if key != "group"}
-    given = table.get("where")
+    given = _of_a_group(table.get("where"))
     if given is not None and not isinstance(given, str):
         return rest  # its own error
     field = cls.model_fields.get("name")
@@ -110,13 +110,10 @@ def as_tuple(value: Any) -> Any:
 
 def _of_a_group(value: Any) -> Any:
     """Returns the expression of { group = "NAME" }, which may have `where` beside it; other values as they are."""
-    if (
-        isinstance(value, dict)
-        and value.keys() <= {"group", "where"}
-        and all(isinstance(v, str) for v in value.values())
-    ):
-        return where.of_group(value["group"], value.get("where")) if "group" in value else value["where"]
-    return value
+    if not isinstance(value, dict) or not {"group"} <= value.keys() <= {"group", "where"}:
+        return value
+    texts = all(isinstance(each, str) for each in value.values())
+    return where.of_group(value["group"], value.get("where")) if texts else value
 
 
 def _readable_expression(text: str) -> str:

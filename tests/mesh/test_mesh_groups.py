@@ -129,6 +129,13 @@ def test_sets_of_abaqus_and_numbers_of_medit(tmp_path):
     assert list(mesh.groups) == ["3"] and np.array_equal(mesh.elements_of("3"), LEFT)
 
 
+def test_numbers_that_count_something_are_no_groups(tmp_path):
+    large = bar([5, 4, 1], [5.0, 4.0, 1.0])
+    numbers = {"medit:ref": [np.arange(len(large.tets))]}
+    meshio.Mesh(large.rest, [("tetra", large.tets)], cell_data=numbers).write(tmp_path / "a.mesh")
+    assert len(large.tets) > 100 and read(tmp_path / "a.mesh").groups == {}
+
+
 def test_a_group_of_split_cells_has_their_tetrahedra(tmp_path):
     """Of hexahedra beside tetrahedra in the same file, whichever comes first; nodes without a cell are renumbered."""
     corners = np.array([[x, y, z] for z in (0, 1) for y in (0, 1) for x in (0, 1)], float)
@@ -220,6 +227,8 @@ def test_one_region_is_set_by_its_name(organ):
         ('fixed = { group = "ligamnet" }', "no group 'ligamnet' in organ.msh; groups of it: ligament (nodes), re"),
         ("fixed = { group = 7 }", "effects.fixed.group = 7: must be the name of a group"),
         ('corotational = { young = [{ group = "ligament", young = 1 }], poisson = 0 }', "'ligament' of organ.msh has"),
+        ("fixed = { where = { } }", "effects.fixed.where: must be a string"),
+        ("fixed = { group = 'ligament', where = { group = 'rumour' } }", "no group 'rumour' in organ.msh"),
         ("fixed = { where = 'group(X)' }", "group takes one name in quotes"),
     ],
 )  # fmt: skip
