@@ -94,7 +94,7 @@ class Scene(_message.Message):
     def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., name: _Optional[str] = ..., toml: _Optional[str] = ..., resolved: _Optional[str] = ..., dt: _Optional[float] = ..., started_ns: _Optional[int] = ..., software: _Optional[str] = ..., objects: _Optional[_Iterable[str]] = ..., server: _Optional[str] = ..., device: _Optional[str] = ..., build: _Optional[str] = ..., obstacles: _Optional[_Iterable[str]] = ...) -> None: ...
 
 class Topology(_message.Message):
-    __slots__ = ("header", "nodes", "rest", "tets", "triangles", "row_start", "columns", "fixed", "young", "poisson", "reference", "skin_nodes", "skin_weights", "skin_triangles", "removed", "cut", "quadratic")
+    __slots__ = ("header", "nodes", "rest", "tets", "triangles", "row_start", "columns", "fixed", "young", "poisson", "reference", "skin_nodes", "skin_weights", "skin_triangles", "removed", "cut", "quadratic", "groups")
     HEADER_FIELD_NUMBER: _ClassVar[int]
     NODES_FIELD_NUMBER: _ClassVar[int]
     REST_FIELD_NUMBER: _ClassVar[int]
@@ -112,6 +112,7 @@ class Topology(_message.Message):
     REMOVED_FIELD_NUMBER: _ClassVar[int]
     CUT_FIELD_NUMBER: _ClassVar[int]
     QUADRATIC_FIELD_NUMBER: _ClassVar[int]
+    GROUPS_FIELD_NUMBER: _ClassVar[int]
     header: Header
     nodes: int
     rest: bytes
@@ -129,7 +130,20 @@ class Topology(_message.Message):
     removed: bytes
     cut: int
     quadratic: bytes
-    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., nodes: _Optional[int] = ..., rest: _Optional[bytes] = ..., tets: _Optional[bytes] = ..., triangles: _Optional[bytes] = ..., row_start: _Optional[bytes] = ..., columns: _Optional[bytes] = ..., fixed: _Optional[bytes] = ..., young: _Optional[bytes] = ..., poisson: _Optional[bytes] = ..., reference: _Optional[bytes] = ..., skin_nodes: _Optional[bytes] = ..., skin_weights: _Optional[bytes] = ..., skin_triangles: _Optional[bytes] = ..., removed: _Optional[bytes] = ..., cut: _Optional[int] = ..., quadratic: _Optional[bytes] = ...) -> None: ...
+    groups: _containers.RepeatedCompositeFieldContainer[Group]
+    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., nodes: _Optional[int] = ..., rest: _Optional[bytes] = ..., tets: _Optional[bytes] = ..., triangles: _Optional[bytes] = ..., row_start: _Optional[bytes] = ..., columns: _Optional[bytes] = ..., fixed: _Optional[bytes] = ..., young: _Optional[bytes] = ..., poisson: _Optional[bytes] = ..., reference: _Optional[bytes] = ..., skin_nodes: _Optional[bytes] = ..., skin_weights: _Optional[bytes] = ..., skin_triangles: _Optional[bytes] = ..., removed: _Optional[bytes] = ..., cut: _Optional[int] = ..., quadratic: _Optional[bytes] = ..., groups: _Optional[_Iterable[_Union[Group, _Mapping]]] = ...) -> None: ...
+
+class Group(_message.Message):
+    __slots__ = ("name", "elements", "faces", "nodes")
+    NAME_FIELD_NUMBER: _ClassVar[int]
+    ELEMENTS_FIELD_NUMBER: _ClassVar[int]
+    FACES_FIELD_NUMBER: _ClassVar[int]
+    NODES_FIELD_NUMBER: _ClassVar[int]
+    name: str
+    elements: bytes
+    faces: bytes
+    nodes: bytes
+    def __init__(self, name: _Optional[str] = ..., elements: _Optional[bytes] = ..., faces: _Optional[bytes] = ..., nodes: _Optional[bytes] = ...) -> None: ...
 
 class Matrix(_message.Message):
     __slots__ = ("header", "step", "warp", "blocks", "checksum", "factor_dtype", "method", "known_patterns", "lease", "factor_slot", "matrix_slot", "worker", "drop_tolerance", "fill", "omega", "nodes")

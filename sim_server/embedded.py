@@ -14,11 +14,11 @@ import numpy as np
 import scipy  # noqa: F401  where it is needed it is imported later: a client alone is told of it here
 from numpy.typing import ArrayLike, NDArray
 
-from sim_server import mesh as meshes
 from sim_server import scene as scenes
 from sim_server import simulation as simulations
 from sim_server.arrays import Float64
 from sim_server.errors import InputError
+from sim_server.mesh.arrays import mesh_of
 from sim_server.state.start import Start
 from sim_server.updates.driver import Driver
 
@@ -26,15 +26,16 @@ OURS = "python"  # the client that pushes of this process are of
 
 
 class Mesh:
-    """Nodes and tetrahedra: points (n, 3) [m], tets (m, 4), numbers of points.
+    """Nodes and tetrahedra: points (n, 3) [m]; tets, numbers of points, (m, 4), or (e, 10) of quadratic elements.
 
-    Tetrahedra are wound to positive volume. Raises InputError for arrays that are no mesh.
+    groups: elements and nodes by name, for `group` in a scene; numbers of elements, or a table of elements, faces and
+    nodes. Tetrahedra are wound to positive volume. Raises InputError for arrays that are no mesh.
     """
 
-    def __init__(self, points: ArrayLike, tets: ArrayLike, name: str = "arrays"):
-        self.checked = meshes.check(
-            meshes.Mesh(_array(points, 3, "points", "fiu"), _array(tets, 4, "tets", "iu"), name)
-        )
+    def __init__(
+        self, points: ArrayLike, tets: ArrayLike, groups: Mapping[str, Any] | None = None, name: str = "arrays"
+    ):
+        self.checked = mesh_of(points, tets, groups, name)
 
     @property
     def points(self) -> Float64:
@@ -57,11 +58,7 @@ class Scene:
     """
 
     def __init__(self, table: Mapping[str, Any], folder: str | Path = "."):
-        plain, given = _without_meshes(table)
-        self.checked = scenes.validated(plain, "from Python", Path(folder))
-        for o in self.checked.objects:
-            if o.name in given:
-                o.use_mesh(given[o.name])
+        self.checked = scenes.validated(_with_meshes(table), "from Python", Path(folder))
 
     @classmethod
     def load(cls, path: str | Path, overrides: Sequence[str] = ()) -> Self:
@@ -188,31 +185,20 @@ class Simulation:
         return self._open.simulation.world.body(name).nodes
 
 
-def _array(given: ArrayLike, width: int, what: str, kinds: str) -> NDArray[Any]:
-    """Returns a C-ordered copy as meshes have it. Raises InputError for another shape or type."""
-    array = np.asarray(given)
-    if array.ndim != 2 or array.shape[1] != width or array.dtype.kind not in kinds:
-        raise InputError(f"mesh: {what} has shape {array.shape} and type {array.dtype}: must be {_ALLOWED[width]}")
-    return np.array(array, dtype=np.float64 if width == 3 else np.int32, order="C")
-
-
-_ALLOWED = {3: "(n, 3), real numbers [m]", 4: "(m, 4), whole numbers"}
-
-
 def _triple(values: Sequence[float]) -> tuple[float, float, float]:
     x, y, z = map(float, values)
     return x, y, z
 
 
-def _without_meshes(table: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, meshes.Mesh]]:
-    """Returns the table with meshes as scenes take them, and these by the names of their objects."""
-    objects, given = table.get("object"), {}
+def _with_meshes(table: Mapping[str, Any]) -> dict[str, Any]:
+    """Returns a table whose meshes are such as scenes take."""
+    objects = table.get("object")
     if not isinstance(objects, list | tuple):
-        return dict(table), {}
-    plain = []
-    for o in objects:
-        if isinstance(o, Mapping) and isinstance(mesh := o.get("mesh"), Mesh):
-            given[str(o.get("name"))] = mesh.checked
-            o = {**o, "mesh": mesh.checked}
-        plain.append(o)
-    return {**table, "object": plain}, given
+        return dict(table)
+    return {**table, "object": [_with_mesh(o) for o in objects]}
+
+
+def _with_mesh(o: Any) -> Any:
+    if isinstance(o, Mapping) and isinstance(mesh := o.get("mesh"), Mesh):
+        return {**o, "mesh": mesh.checked}
+    return o

@@ -115,21 +115,25 @@ class LiveParameters:
     def set(self, values: Mapping[str, str], client: str = "") -> list[LiveParameter]:
         """Sets parameters, all between the same two steps; returns them.
 
-        values: TOML, by key as after --set (object.NAME.effects.EFFECT.KEY) or a short one (NAME.EFFECT.KEY)
+        values: TOML, by key as after --set (object.NAME.effects.EFFECT.KEY) or a short one (NAME.EFFECT.KEY); with
+            [REGION] behind it that of one region
 
         Raises BadParameter; nothing changes then.
         """
         fields = {field.key: field for field in live_fields(self.scene)}
         given: dict[str, LiveField] = {}
+        written: dict[str, tuple[str, str]] = {}  # by full key with region: as it was given, and its value
         for key, text in values.items():
-            field = self._found(key, text, fields)
-            if field.key in given:
-                raise BadParameter(f"{field.key} is set twice")
-            given[field.key] = field
+            short, region = overrides.region_of(key)
+            field = self._found(short, text, fields)
+            whole = f"{field.key}[{region}]" if region else field.key
+            if whole in written or (field.key in given and not (region and field.key not in written)):
+                raise BadParameter(f"{whole} is set twice")
+            written[whole], given[field.key] = (key, text), field
         draft = _draft(self.scene, [f.place for f in given.values()])
-        for (key, text), field in zip(values.items(), given.values(), strict=True):
+        for whole, (key, text) in written.items():
             try:
-                overrides.assign(field.key, overrides.value(text.strip()), text, draft)
+                overrides.assign(whole, overrides.value(text.strip()), text, draft)
             except InputError as error:
                 raise BadParameter(f"{key} = {text}: {error}") from None
         scene = self._validated(draft)

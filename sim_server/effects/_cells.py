@@ -274,7 +274,7 @@ def cells_of(body: Body, params: Any) -> StrainCells:
     if body.elements == "quadratic":
         assert mesh.quadratic is not None
         return quadratic_cells(mesh.rest, mesh.quadratic).in_order()
-    region = region_numbers(params.young, body.centroids)
+    region = region_numbers(params.young, body.centroids, body.mesh.elements_of)
     make = edge_cells if body.elements == "smoothed" else tetrahedron_cells
     return make(mesh.rest, mesh.tets, region).in_order()
 

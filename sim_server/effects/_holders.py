@@ -223,7 +223,7 @@ def _frames(holder: Holder, center: Float64) -> list[tuple[float, list[float]]]:
 def _mask(world: World, holder: Holder) -> NDArray[np.bool_]:
     """Returns which nodes of the scene a holder holds; raises InputError for none, all, or nodes held already."""
     body, held = world.body(holder.object), np.zeros(world.nodes, bool)
-    held[body.nodes] = where.mask(holder.where, body.mesh.rest)
+    held[body.nodes] = where.nodes(holder.where, body.mesh)
     count = int(held.sum())
     if not 0 < count < body.last - body.first:
         raise InputError(
@@ -235,7 +235,7 @@ def _mask(world: World, holder: Holder) -> NDArray[np.bool_]:
     if fixed is not None:
         from sim_server.effects.fixed import clamped_nodes  # what a scene does not list is not imported
 
-        others[body.nodes] |= clamped_nodes(fixed, body.mesh.rest)
+        others[body.nodes] |= clamped_nodes(fixed, body.mesh)
     if (held & others).any():
         raise InputError(
             f"holder {holder.name!r}: {int((held & others).sum())} of its nodes are fixed, or another holder's: a node "

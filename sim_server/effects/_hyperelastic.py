@@ -144,7 +144,7 @@ def constants_of(law: Law, body: Body, params: Any) -> Values:
     """Values of the constants in each element of a body; raises InputError."""
     given = {c.name: getattr(params, c.name) for c in law.constants}
     try:
-        return constants_by_region(given, body.centroids, law.constants[0].unit)
+        return constants_by_region(given, body.centroids, law.constants[0].unit, body.mesh.elements_of)
     except InputError as error:
         raise InputError(f"object {body.name!r}, effect {law.name}: {error}") from error
 

@@ -196,5 +196,5 @@ def bulk_of_patches(law: Law, values: Values) -> Float64:
 
 def _patches_of(law: Law, body: Body, params: Any) -> Int32:
     """Returns the patch of each tetrahedron of a body; none has elements of two regions."""
-    region = region_numbers(getattr(params, law.constants[0].name), body.centroids)
+    region = region_numbers(getattr(params, law.constants[0].name), body.centroids, body.mesh.elements_of)
     return patches(body.mesh.rest, body.mesh.tets, region)

@@ -49,7 +49,7 @@ def _chosen(effect: str, body: Body, chosen: str | None) -> Int32:
     triangles = surface_triangles(body.mesh.tets)
     if chosen is None:
         return outside(body.mesh.rest, triangles) + np.int32(body.first)
-    inside = where.mask(chosen, body.mesh.rest)[triangles].all(axis=1)
+    inside = where.nodes(chosen, body.mesh)[triangles].all(axis=1)
     if not inside.any():
         raise InputError(
             f"object {body.name!r}: {effect} where = {chosen!r} holds all nodes of 0 of {len(triangles)} triangles of "

@@ -150,7 +150,7 @@ class Wall:
         assert chamber.where is not None
         self.body, self.where = body, chamber.where
         triangles = surface_triangles(body.mesh.tets)
-        wall = triangles[where.mask(chamber.where, body.mesh.rest)[triangles].all(axis=1)]
+        wall = triangles[where.nodes(chamber.where, body.mesh)[triangles].all(axis=1)]
         said = f"object {body.name!r}: cavity where = {chamber.where!r}"
         if not len(wall):
             raise InputError(f"{said} holds all nodes of 0 of {len(triangles)} triangles of the surface")

@@ -229,7 +229,7 @@ class Corotational(Effect):
 
 def _constants(body: Body, params: Params) -> tuple[Float64, Float64]:
     try:
-        return region_values(params.young, params.poisson, body.centroids)
+        return region_values(params.young, params.poisson, body.centroids, body.mesh.elements_of)
     except InputError as error:
         raise InputError(f"object {body.name!r}, effect corotational: {error}") from error
 

@@ -38,7 +38,7 @@ from sim_server.effects._base import Effect
 from sim_server.errors import InputError
 from sim_server.mechanics.rollers import Rollers, span_of
 from sim_server.mechanics.world import Body, World
-from sim_server.mesh import pose_matrix
+from sim_server.mesh import Mesh, pose_matrix
 from sim_server.scene import where
 from sim_server.scene.parameters import Parameters, Where, as_tuple, complaint, where_or_tables
 
@@ -90,12 +90,12 @@ class Params(Parameters):
         return (Group(where=self.where, along=self.along),)
 
 
-def clamped_nodes(params: Params, rest: Float64) -> NDArray[np.bool_]:
-    """Returns which nodes a group holds along all directions, (n,). rest (n, 3) [m]."""
-    held = np.zeros(len(rest), bool)
+def clamped_nodes(params: Params, mesh: Mesh) -> NDArray[np.bool_]:
+    """Returns which nodes a group holds along all directions, (n,)."""
+    held = np.zeros(len(mesh.rest), bool)
     for group in params.groups:
         if group.along is None:
-            held |= where.mask(group.where, rest)
+            held |= where.nodes(group.where, mesh)
     return held
 
 
@@ -127,7 +127,7 @@ def _directions(world: World, body: Body, params: Params) -> list[Float64]:
     turned = pose_matrix(world.at_start(lambda scene: scene.objects[body.index].pose.rotate))
     vectors: list[list[Float64]] = [[] for _ in body.mesh.rest]
     for group in params.groups:
-        held = where.mask(group.where, body.mesh.rest)
+        held = where.nodes(group.where, body.mesh)
         if not held.any():
             raise InputError(
                 f"object {body.name!r}: fixed where = {group.where!r} holds 0 of {len(held)} nodes; "

@@ -180,7 +180,7 @@ class MassSpring(Effect):
 
 def _young(body: Body, params: Params) -> Float64:
     try:
-        return region_values(params.young or 0.0, POISSON, body.centroids)[0]
+        return region_values(params.young or 0.0, POISSON, body.centroids, body.mesh.elements_of)[0]
     except InputError as error:
         raise InputError(f"object {body.name!r}, effect mass_spring: {error}") from error
 

@@ -196,7 +196,7 @@ def _open_nodes(world: World, listed: list[tuple[Body, Any]]) -> Float64:
     for body, params in listed:
         if params.drained is None:
             continue
-        chosen = where.mask(params.drained, body.mesh.rest)
+        chosen = where.nodes(params.drained, body.mesh)
         if not chosen.any():
             raise InputError(
                 f"object {body.name!r}: poroelasticity drained = {params.drained!r} holds 0 of {len(chosen)} nodes; it "

@@ -117,7 +117,7 @@ def _shape(body: Body, params: Params) -> Float64:
 
 
 def _nodes(body: Body, params: Params) -> Any:
-    chosen = where.mask(params.where or "true", body.mesh.rest)
+    chosen = where.nodes(params.where or "true", body.mesh)
     if not chosen.any():
         raise InputError(
             f"object {body.name!r}: target where = {params.where!r} holds 0 of {len(chosen)} nodes; it must hold "

@@ -114,7 +114,7 @@ class Part:
         assert load.where is not None
         self.name, self.where = body.name, load.where
         triangles = surface_triangles(body.mesh.tets)
-        inside = where.mask(load.where, body.mesh.rest)[triangles].all(axis=1)
+        inside = where.nodes(load.where, body.mesh)[triangles].all(axis=1)
         if not inside.any():
             raise InputError(
                 f"object {body.name!r}: traction where = {load.where!r} holds all nodes of 0 of {len(triangles)} "

@@ -69,7 +69,7 @@ def ties_alone(world: World, ties: Ties) -> Contact:
 
 def _attached(world: World, number: int, a: Attachment) -> list[_Row]:
     body = world.body(a.object)
-    nodes = np.flatnonzero(where.mask(a.where, body.mesh.rest)) + body.first
+    nodes = np.flatnonzero(where.nodes(a.where, body.mesh)) + body.first
     if not len(nodes):
         raise InputError(f"attachment {a.name!r}: where = {a.where!r} has no node of object {a.object!r}")
     given = (number, a.stiffness, 0.0, 0.0, a.breaking or np.inf)

@@ -6,8 +6,8 @@ import io
 import itertools
 import logging
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from os.path import isfile
 from pathlib import Path
@@ -22,6 +22,7 @@ from sim_server.errors import InputError
 from sim_server.mesh.cells import tetrahedra
 from sim_server.mesh.check import complaints, crowded_faces, indices
 from sim_server.mesh.check_quadratic import quadratic_complaints, wound
+from sim_server.mesh.groups import Group, entities_without_group, listed, read_groups, unknown
 from sim_server.mesh.quadratic import quadratic_cells_of, sub_tetrahedra, with_mid_nodes
 from sim_server.mesh.surface import volumes
 
@@ -38,6 +39,7 @@ class Mesh:
     nodes of the file that are left out, so that the others have other numbers than there.
     quadratic: int32 (e, 10), elements with a node on each edge (order: quadratic.py), None for linear ones; the tets
     are then eight of each element, one element's after another's.
+    groups: named elements and nodes.
     """
 
     rest: Float64
@@ -45,6 +47,7 @@ class Mesh:
     name: str = "mesh"
     dropped: int = 0
     quadratic: Int32 | None = None
+    groups: Mapping[str, Group] = field(default_factory=dict)
 
     @property
     def centroids(self) -> Float64:
@@ -65,7 +68,24 @@ class Mesh:
         if self.quadratic is not None:
             return self
         rest, quadratic = with_mid_nodes(self.rest, self.tets)
-        return replace(self, rest=rest, tets=sub_tetrahedra(rest, quadratic), quadratic=quadratic)
+        groups = {name: group.with_mid_nodes(quadratic) for name, group in self.groups.items()}
+        return replace(self, rest=rest, tets=sub_tetrahedra(rest, quadratic), quadratic=quadratic, groups=groups)
+
+    def nodes_of(self, group: str) -> NDArray[np.bool_]:
+        """Returns which nodes a group has, (n,). Raises InputError, which lists the groups that there are."""
+        if group not in self.groups:
+            raise unknown(group, self.groups, self.name)
+        return self.groups[group].holds(self.tets, len(self.rest))
+
+    def elements_of(self, group: str) -> NDArray[np.bool_]:
+        """Returns which tetrahedra a group has, (m,). Raises InputError for an unknown one, and for one of nodes."""
+        if group not in self.groups:
+            raise unknown(group, self.groups, self.name)
+        if not len(self.groups[group].elements):
+            raise InputError(f"group {group!r} of {self.name} has no elements; groups of it: {listed(self.groups)}")
+        held = np.zeros(len(self.tets), bool)
+        held[self.groups[group].elements] = True
+        return held
 
 
 def bar(cells: Sequence[int], size: Sequence[float], split: str = "mirrored") -> Mesh:
@@ -117,7 +137,8 @@ def read(path: str | Path, quadratic: bool = False) -> Mesh:
 
     quadratic: keeps quadratic tetrahedra where all volume cells are such.
     Other quadratic cells are reduced to their corners; hexahedra, wedges and pyramids are split (cells.py). Triangles,
-    lines and points of the file are left out, and so are nodes without a cell; what was changed is logged in one line.
+    lines and points of the file are left out but for the nodes of named groups, and so are nodes without a cell; what
+    was changed is logged in one line.
     Raises InputError naming the file: missing, unreadable, unknown format, or cells that cannot be used.
     """
     path = Path(path)
@@ -142,10 +163,15 @@ def read(path: str | Path, quadratic: bool = False) -> Mesh:
         changed.append(f"{dropped} of {len(rest)} nodes dropped, {where}")
     if changed:
         log.warning("mesh %s: %s", path, "; ".join(changed))
-    rest, numbered = rest[used], (np.cumsum(used) - 1)[cells].astype(np.int32)
+    numbers = np.where(used, np.cumsum(used) - 1, -1)
+    try:
+        groups = read_groups(data, numbers, bool(kept))
+    except (IndexError, ValueError, TypeError) as error:
+        raise InputError(f"mesh {path}: its groups cannot be read ({error})") from error
+    rest, numbered = rest[used], numbers[cells].astype(np.int32)
     if kept:
-        return Mesh(rest, sub_tetrahedra(rest, numbered), path.name, dropped, numbered)
-    return Mesh(rest, numbered, path.name, dropped)
+        return Mesh(rest, sub_tetrahedra(rest, numbered), path.name, dropped, numbered, groups)
+    return Mesh(rest, numbered, path.name, dropped, None, groups)
 
 
 def meshio_read(path: Path, what: str = "mesh") -> Any:
@@ -158,7 +184,8 @@ def meshio_read(path: Path, what: str = "mesh") -> Any:
     formats = f"formats by extension: {' '.join(sorted(extension_to_filetypes))}"
     said = io.StringIO()  # meshio prints its reasons, and ends the process where it cannot read a file
     try:
-        with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said), np.errstate(all="ignore"):
+        quiet = contextlib.redirect_stdout(said), contextlib.redirect_stderr(said)
+        with quiet[0], quiet[1], np.errstate(all="ignore"), entities_without_group():
             return meshio.read(path)
     except ImportError as error:
         raise InputError(f"{what} {path}: reading it needs the Python package {error.name!r}") from error

@@ -12,6 +12,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sim_server.arrays import Float64, Int64
 from sim_server.errors import InputError
@@ -24,6 +25,7 @@ FACES: dict[str, tuple[tuple[int, ...], ...]] = {
     "pyramid": ((0, 3, 2, 1), (0, 1, 4), (1, 2, 4), (2, 3, 4), (3, 0, 4)),
 }
 CORNERS = {"tetra": 4, "hexahedron": 8, "wedge": 6, "pyramid": 5}
+TETS = {"tetra": 1, "hexahedron": 6, "wedge": 3, "pyramid": 2}  # that each is split into
 SHAPE = {  # of each type of cell that is read; the corners of quadratic ones come first
     "tetra": "tetra", "tetra10": "tetra",
     "hexahedron": "hexahedron", "hexahedron20": "hexahedron", "hexahedron27": "hexahedron",
@@ -52,10 +54,19 @@ def tetrahedra(rest: Float64, blocks: Sequence[Any]) -> tuple[Int64, list[str]]:
     tets = [cells.pop("tetra")]
     for shape, corners in cells.items():
         if len(corners):
-            tets.append(_split(rest, shape, corners))
+            tets.append(split(rest, shape, corners))
             said.append(f"{len(corners)} {shape} cells split into {len(tets[-1])} tetrahedra")
     _check_diagonals(np.concatenate(tets), cells)
     return np.concatenate(tets), said
+
+
+def per_tetrahedron(blocks: Sequence[Any], values: Sequence[NDArray[Any]]) -> NDArray[Any]:
+    """Returns what each tetrahedron of `tetrahedra` has of the values of its cell, (m,). values: of each block"""
+    parts = []
+    for shape, count in TETS.items():
+        own = [v for b, v in zip(blocks, values, strict=True) if b.dim == 3 and SHAPE.get(b.type) == shape]
+        parts += [np.repeat(v, count) for v in own]
+    return np.concatenate(parts)
 
 
 def _corners(shape: str, blocks: Sequence[Any]) -> Int64:
@@ -64,13 +75,13 @@ def _corners(shape: str, blocks: Sequence[Any]) -> Int64:
     return np.concatenate([np.empty((0, count), np.int64), *parts]).astype(np.int64)
 
 
-def _split(rest: Float64, shape: str, corners: Int64) -> Int64:
-    """Splits the cells (m, c) into tetrahedra of positive volume, (k m, 4), k per cell."""
+def split(rest: Float64, shape: str, corners: Int64) -> Int64:
+    """Splits cells (m, c) of a shape, not tetra, into tetrahedra of positive volume, (k m, 4), k per cell."""
     if ((corners < 0) | (corners >= len(rest))).any():
         bad = int(np.flatnonzero(((corners < 0) | (corners >= len(rest))).any(axis=1))[0])
         raise InputError(f"{shape} {bad} has nodes {corners[bad].tolist()}: must be 0 to {len(rest) - 1}")
     least = corners.argmin(axis=1)
-    tets = np.empty((len(corners), {"hexahedron": 6, "wedge": 3, "pyramid": 2}[shape], 4), np.int64)
+    tets = np.empty((len(corners), TETS[shape], 4), np.int64)
     for apex in range(CORNERS[shape]):
         here = corners[least == apex]
         opposite = [_triangles(here, face) for face in FACES[shape] if apex not in face]

@@ -53,6 +53,20 @@ def scene(simulation: Simulation) -> pb.Scene:
     )
 
 
+def published(message: pb.Scene) -> pb.Scene:
+    """Returns a scene as the network has it: texts of meshes are left out, since topologies hold these meshes."""
+    table = json.loads(message.resolved)
+    large = [o["mesh"] for o in table["object"] if "data" in o["mesh"]]
+    if not large:
+        return message
+    for mesh in large:
+        mesh["data"] = ""
+    sent = pb.Scene()
+    sent.CopyFrom(message)
+    sent.resolved = json.dumps(table)
+    return sent
+
+
 def topology(simulation: Simulation, body: Body) -> pb.Topology:
     """Converts mesh and block pattern of one object, epoch 1."""
     pose = simulation.scene.objects[body.index].pose
@@ -72,6 +86,9 @@ def topology(simulation: Simulation, body: Body) -> pb.Topology:
         message.reference = _bytes(body.mesh.rest, "<f8")
     if body.mesh.quadratic is not None:
         message.quadratic = _bytes(body.mesh.quadratic, "<i4")
+    for name, group in body.mesh.groups.items():
+        parts = (_bytes(part, "<i4") for part in (group.elements, group.faces, group.nodes))
+        message.groups.append(pb.Group(**dict(zip(("elements", "faces", "nodes"), parts, strict=True)), name=name))
     if body.skin is not None:
         message.skin_nodes, message.skin_weights = _bytes(body.skin.nodes, "<i4"), _bytes(body.skin.weights, "<f8")
         message.skin_triangles = _bytes(body.skin.triangles, "<i4")

@@ -38,7 +38,7 @@ from sim_server.simulation import Simulation
 from sim_server.state import code
 from sim_server.state.start import Start
 from sim_server.updates.factor_source import Inline, Job
-from sim_server.updates.worker_assembly import Assembly
+from sim_server.updates.worker_assembly import Assembly, mesh_of_topology
 
 if TYPE_CHECKING:
     from sim_server.effects.touch import Interaction
@@ -58,7 +58,7 @@ class Replay:
                 recording.notes.append(
                     'recorded with warp = "auto", repeated with true: steps that were tried without may differ'
                 )
-            scene, watched = Scene.model_validate(table), "on_runaway" in table.get("solver", {})
+            scene, watched = self._scene(table), "on_runaway" in table.get("solver", {})
         except ValidationError as error:
             reason, software = str(readable(error, f"in {recording.path.name}", table)), recording.scene.software
             reason += f"; recorded with {software}" if " effect " in software else ""
@@ -162,6 +162,19 @@ class Replay:
             for step, both in enumerate(self._taken[body.name].tolist(), self.recording.first):
                 uses |= {(body.name, made): step for made in both if made >= 0}
         return uses
+
+    def _scene(self, table: dict[str, Any]) -> Scene:
+        """Returns the validated scene of the log; meshes that were made by filling a surface are those of the log, so
+        neither surface nor mesher is needed."""
+        listed = table["object"] if isinstance(table.get("object"), list) else []
+        meshes = [o.get("mesh") for o in listed if isinstance(o, dict)]
+        filled = any(isinstance(mesh, dict) and mesh.get("surface") for mesh in meshes)
+        scene = Scene.model_validate(table, context={"files": "known"} if filled else None)
+        for o in scene.objects if filled else ():
+            recorded = self.recording.objects.get(o.name)
+            if o.mesh.surface is not None and recorded is not None and recorded.topology is not None:
+                o.use_mesh(mesh_of_topology(recorded.topology))
+        return scene
 
     def _same_meshes(self) -> None:
         if [b.name for b in self.bodies] != list(self.recording.scene.objects):

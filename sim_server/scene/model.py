@@ -1,9 +1,7 @@
 # SPDX-License-Identifier: MIT
 """The tables of a scene file as pydantic models. `load` in __init__.py reads a file."""
 
-from dataclasses import replace
 from functools import partial
-from hashlib import sha256
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -21,7 +19,7 @@ from pydantic import (
 from pydantic_core import InitErrorDetails, PydanticCustomError
 
 from sim_server.errors import InputError
-from sim_server.mesh import Mesh, bar, check, read
+from sim_server.mesh import Mesh
 from sim_server.scene.accuracy_options import MOST_LINEARIZATIONS, ROUNDING, AccuracyOptions
 from sim_server.scene.effect_tables import checked_effects
 from sim_server.scene.elements import Elements, element_errors, keeps_mid_nodes
@@ -30,57 +28,15 @@ from sim_server.scene.holders import Holder, check_holders_on, holder_errors
 from sim_server.scene.integrator_options import IntegratorOptions
 from sim_server.scene.live import Live
 from sim_server.scene.materials import Material, with_material
+from sim_server.scene.mesh_source import MeshSource
 from sim_server.scene.obstacles import FRICTION, Obstacle, check_contact_on, contact_errors
-from sim_server.scene.parameters import Count, Counts, File, Name, NotNegative, Parameters, Positive, Sizes, complaint
+from sim_server.scene.parameters import Count, File, Name, NotNegative, Parameters, Positive, complaint
 from sim_server.scene.pose import Pose
 from sim_server.scene.solver_options import SolverOptions
 from sim_server.scene.ties import Attachment, Spring, tie_errors
 
 if TYPE_CHECKING:
     from sim_server.mesh.skin import Skin
-
-
-class MeshSource(Parameters):
-    """Source of a mesh: { bar = cells, size = m } or { file = path }; of one given from Python its digest."""
-
-    bar: Counts | None = Field(default=None, description="cells along x, y, z; each is split into 6 tetrahedra")
-    size: Sizes | None = Field(default=None, description="size of the bar along x, y, z [m]")
-    split: Literal["kuhn", "mirrored"] | None = Field(
-        default=None,
-        description="split of the cells of a bar: mirrored (default), or kuhn, which bends less, with a twist",
-    )
-    scale: Positive | None = Field(
-        default=None, description="scale of the coordinates in a file: 0.001 for a mesh in mm"
-    )
-    file: File | None = Field(default=None, description="a file that meshio reads")
-    arrays: str | None = Field(default=None, description="digest of a mesh that a program gives; not for scene files")
-
-    @model_validator(mode="before")
-    @classmethod
-    def _of_a_program(cls, table: Any) -> Any:
-        """Names a mesh that a program gives; the object gets it by `use_mesh`."""
-        if isinstance(table, Mesh):
-            return {"arrays": sha256(table.rest.tobytes() + table.tets.tobytes()).hexdigest()[:24]}
-        return table
-
-    @model_validator(mode="before")
-    @classmethod
-    def _named_split(cls, table: Any) -> Any:
-        """Names the split of a bar, so that a log or a checkpoint tells it whatever the default is when it is read."""
-        if isinstance(table, dict) and table.get("bar") is not None and table.get("split") is None:
-            return {**table, "split": "mirrored"}
-        return table
-
-    @model_validator(mode="after")
-    def _one_source(self) -> "MeshSource":
-        given = [name for name in ("bar", "size", "file", "arrays") if getattr(self, name) is not None]
-        if self.split is not None and self.bar is None:
-            raise complaint("split belongs to a bar")
-        if self.scale is not None and self.file is None:
-            raise complaint("scale belongs to a file; a bar has its size in m")
-        if given not in (["bar", "size"], ["file"], ["arrays"]):
-            raise complaint(f"must be {{ bar = [nx, ny, nz], size = [sx, sy, sz] }} or {{ file = ... }}, not {given}")
-        return self
 
 
 def _effects(scope: str) -> tuple[PlainValidator, PlainSerializer]:
@@ -155,19 +111,8 @@ class SceneObject(Parameters):
         """Returns the checked mesh at rest, before the pose. Raises InputError that names the object."""
         if self._given is not None:
             return self._given
-        source = self.mesh
-        if source.arrays is not None:
-            raise InputError(
-                f"object {self.name!r}: mesh.arrays = {source.arrays!r}: a mesh that a program gives; "
-                "a scene file has bar or file"
-            )
         try:
-            if source.file is not None:
-                mesh = read(source.file, self._keeps_mid_nodes)
-                mesh = check(replace(mesh, rest=mesh.rest * (source.scale or 1.0)))
-            else:
-                assert source.bar is not None and source.size is not None and source.split is not None
-                mesh = bar(source.bar, source.size, source.split)
+            mesh = self.mesh.read(self._keeps_mid_nodes)
             return mesh.with_mid_nodes() if self.elements == "quadratic" else mesh
         except InputError as error:
             raise InputError(f"object {self.name!r}: {error}") from error

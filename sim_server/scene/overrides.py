@@ -16,7 +16,7 @@ Place = tuple[str | int, ...]
 
 def apply(override: str, table: dict[str, Any]) -> Place:
     """Sets one value of a parsed scene: ``solver.tolerance=1e-8``, ``object.NAME.effects.corotational.young=1e6``,
-    ``obstacle.NAME.friction=0.2``; returns its place. Raises InputError as `assign` does.
+    ``obstacle.NAME.friction=0.2``, ``...young[REGION]=2e4``; returns its place. Raises InputError as `assign` does.
     """
     key, equals, text = override.partition("=")
     text = text.strip()
@@ -36,7 +36,7 @@ def assign(key: str, given: Any, text: str, table: dict[str, Any], replace: bool
     Missing tables on the way are created, so that an override may list an effect. The validation of the scene finds
     unknown keys. Raises InputError for an unknown object or a key below a value that is no table.
     """
-    if not all(key.split(".")):
+    if not all(region_of(key)[0].split(".")):
         raise InputError(KEY_VALUE)
     place, rest = table, key
     at: Place = ()
@@ -44,6 +44,7 @@ def assign(key: str, given: Any, text: str, table: dict[str, Any], replace: bool
         if key == kind or key.startswith(f"{kind}."):
             place, at, rest = _named(kind, key.removeprefix(kind).lstrip("."), table)
             break
+    rest, region = region_of(rest)
     *parents, last = rest.split(".")
     for depth, part in enumerate(parents):
         below = place.get(part)
@@ -53,14 +54,36 @@ def assign(key: str, given: Any, text: str, table: dict[str, Any], replace: bool
             raise InputError(f"{'.'.join(parents[: depth + 1])} = {below!r} is no table, so it has no keys")
         place = below
     there: Any = place.get(last)
+    if region:
+        index = _index(there, region, last)
+        place[last] = [{**each, last: given} if k == index else each for k, each in enumerate(there)]
+        return (*at, *parents, last, index, last)
     if _tables(there) and not _tables(given):
         raise InputError(
             f"{last} is a list of {len(there)} regions in the scene, which one value would take the place of; allowed: "
-            f"a list of regions, for all elements {key}=[{{ {last} = {text} }}]"
+            f"{last}[NAME] for a region that has a name, and a list of regions, for all elements "
+            f"{key}=[{{ {last} = {text} }}]"
         )
     if replace or given != {} or not (isinstance(there, dict) or there is True):
         place[last] = given
     return (*at, *parents, last)
+
+
+def region_of(key: str) -> tuple[str, str]:
+    """Returns a key without the name of a region at its end, and that name: young[tumour]; "" without one."""
+    found = re.fullmatch(r"([^\[\]]*)\[(.+)\]", key)
+    return (found.group(1), found.group(2)) if found else (key, "")
+
+
+def _index(regions: Any, name: str, key: str) -> int:
+    """Returns the place of the region of this name in a list. Raises InputError."""
+    listed = regions if _tables(regions) else []
+    names = [region.get("name", region.get("group")) for region in listed]
+    if names.count(name) != 1:
+        known = [str(n) for n in names if n is not None]
+        wrong = "no region" if name not in names else f"{names.count(name)} regions"
+        raise InputError(f"{key} has {wrong} {name!r}" + nearest(name, known, "names of regions"))
+    return names.index(name)
 
 
 def _tables(value: Any) -> bool:

@@ -47,12 +47,32 @@ class Parameters(BaseModel):
     @model_validator(mode="wrap")
     @classmethod
     def _name_the_known_keys(cls, table: Any, validate: ValidatorFunctionWrapHandler) -> Any:
+        chooses = "where" in cls.model_fields and "group" not in cls.model_fields
         try:
-            return validate(table)
+            return validate(_with_group(cls, table) if chooses else table)
         except ValidationError as error:
-            known = [field.alias or name for name, field in cls.model_fields.items()]
+            known = [field.alias or name for name, field in cls.model_fields.items()] + ["group"] * chooses
             details = [_with_known_keys(e, known) for e in error.errors(include_url=False)]
             raise ValidationError.from_exception_data(cls.__name__, details) from None
+
+
+def _with_group(cls: type[Parameters], table: Any) -> Any:
+    """Returns a table with its key `group` as part of `where`, so that all who read `where` know groups.
+
+    A table that may have a name, but need not, has that of the group.
+    """
+    if not isinstance(table, dict) or "group" not in table:
+        return table
+    if not isinstance(table["group"], str):
+        error = InitErrorDetails(type=complaint("must be the name of a group"), loc=("group",), input=table["group"])
+        raise ValidationError.from_exception_data(cls.__name__, [error])
+    rest = {key: value for key, value in table.items() if key != "group"}
+    given = _of_a_group(table.get("where"))
+    if given is not None and not isinstance(given, str):
+        return rest  # its own error
+    field = cls.model_fields.get("name")
+    named = {"name": table["group"]} if field is not None and not field.is_required() else {}
+    return {**named, **rest, "where": where.of_group(table["group"], given)}
 
 
 def _with_known_keys(error: Any, known: list[str]) -> InitErrorDetails:
@@ -86,6 +106,14 @@ def where_or_tables(params: Any, beside: Sequence[str]) -> None:
 def as_tuple(value: Any) -> Any:
     """Converts an array of TOML to a tuple; other values stay as they are."""
     return tuple(value) if isinstance(value, list) else value
+
+
+def _of_a_group(value: Any) -> Any:
+    """Returns the expression of { group = "NAME" }, which may have `where` beside it; other values as they are."""
+    if not isinstance(value, dict) or not {"group"} <= value.keys() <= {"group", "where"}:
+        return value
+    texts = all(isinstance(each, str) for each in value.values())
+    return where.of_group(value["group"], value.get("where")) if texts else value
 
 
 def _readable_expression(text: str) -> str:
@@ -123,5 +151,5 @@ NotNegative = Annotated[float, Field(ge=0)]
 Sizes = Annotated[tuple[Positive, Positive, Positive], BeforeValidator(as_tuple)]
 Count = Annotated[int, Field(ge=1, le=1_000_000)]
 Counts = Annotated[tuple[Count, Count, Count], BeforeValidator(as_tuple)]
-Where = Annotated[str, AfterValidator(_readable_expression)]
+Where = Annotated[str, BeforeValidator(_of_a_group), AfterValidator(_readable_expression)]
 File = Annotated[str, AfterValidator(_found)]

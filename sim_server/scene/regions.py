@@ -24,6 +24,9 @@ class Selection(Parameters):
     """Selects the elements whose centroid satisfies `where`, or all remaining ones without it."""
 
     where: Where | None = Field(default=None, description="an expression in X, Y, Z, the rest coordinates [m]")
+    name: Annotated[str, Field(min_length=1, max_length=200)] | None = Field(
+        default=None, description="by which its constants are set; that of its group if left out"
+    )
 
 
 class Region(Selection):
@@ -103,7 +106,9 @@ def by_region(kinds: Mapping[str, Any]) -> Any:
     ]
 
 
-def constants_by_region(constants: Mapping[str, Any], points: Float64, unit: str = "") -> dict[str, Float64]:
+def constants_by_region(
+    constants: Mapping[str, Any], points: Float64, unit: str = "", members: where.Members | None = None
+) -> dict[str, Float64]:
     """Returns each constant of each element by name: (m,), or (m, 3) for vectors.
 
     Raises InputError for an element in no region.
@@ -111,7 +116,7 @@ def constants_by_region(constants: Mapping[str, Any], points: Float64, unit: str
     constants: by name as in the scene; the first may be a list of regions, of which the first that holds at the
         centroid wins
     points: centroids at rest, before the pose [m], (m, 3)
-    unit: of the first constant, for messages
+    unit: of the first constant, for messages; members: which elements groups of the mesh have
     """
     first, *others = constants
     regions = constants[first]
@@ -123,7 +128,7 @@ def constants_by_region(constants: Mapping[str, Any], points: Float64, unit: str
     chosen = {first: np.zeros((len(points), *np.shape(getattr(regions[0], first)))), **chosen}
     left = np.ones(len(points), dtype=bool)
     for i, region in enumerate(regions):
-        here = left & where.mask(region.where or "true", points)
+        here = left & where.mask(region.where or "true", points, members)
         if not here.any():
             value = getattr(region, first)
             shown = f"{value:g} {unit}".strip() if isinstance(value, float) else value
@@ -146,21 +151,23 @@ def _everywhere(value: Any, elements: int) -> Float64:
     return np.broadcast_to(np.asarray(value, float), (elements, *np.shape(value))).copy()
 
 
-def region_values(young: float | list[Region], poisson: float | None, points: Float64) -> tuple[Float64, Float64]:
+def region_values(
+    young: float | list[Region], poisson: float | None, points: Float64, members: where.Members | None = None
+) -> tuple[Float64, Float64]:
     """Returns Young's modulus [Pa] and Poisson's ratio [-] of each element, (m,) each; see constants_by_region."""
-    found = constants_by_region({"young": young, "poisson": poisson}, points, "Pa")
+    found = constants_by_region({"young": young, "poisson": poisson}, points, "Pa", members)
     return found["young"], found["poisson"]
 
 
-def region_numbers(value: Any, points: Float64) -> Int32:
+def region_numbers(value: Any, points: Float64, members: where.Members | None = None) -> Int32:
     """Returns the region of each element, (m,): its place in the list of regions, 0 where there is one value for all.
 
-    value: the constant that may be a list of regions; points: centroids at rest, before the pose [m], (m, 3)
+    value: the constant that may be a list of regions; points, members: as of constants_by_region
     """
     number = np.zeros(len(points), np.int32)
     left = np.ones(len(points), dtype=bool)
     for i, region in enumerate(value if isinstance(value, list) else []):
-        here = left & where.mask(region.where or "true", points)
+        here = left & where.mask(region.where or "true", points, members)
         number[here] = i
         left &= ~here
     return number

@@ -1,17 +1,20 @@
 # SPDX-License-Identifier: MIT
 """Safe expressions that select nodes or elements by rest position, such as ``X < 0.01 and abs(Y - 1) <= 0.5``.
 
-X, Y, Z are rest coordinates [m], before the pose. The text is parsed with `ast`, checked against a whitelist and
+X, Y, Z are rest coordinates [m], before the pose; ``group("tumour")`` holds at what a group of the mesh has (`nodes`,
+`elements`). The text is parsed with `ast`, checked against a whitelist and
 evaluated over arrays; Python never executes it. `and` and `or` evaluate their right side only where the left side has
 not decided yet, as in Python, so ``X > 0 and 1/X < 3`` is safe at X = 0.
 """
 
 import ast
+import json
 import math
 import operator
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import reduce
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,14 +22,19 @@ from numpy.typing import NDArray
 from sim_server.arrays import Float64
 from sim_server.errors import InputError
 
+if TYPE_CHECKING:
+    from sim_server.mesh import Mesh
+
 ALLOWED = (
     "allowed: the rest coordinates X, Y, Z [m], numbers, + - * / **, comparisons (< <= > >= == !=, also chained), "
-    "and, or, not, parentheses, abs(a), sqrt(a), min(a, b, ...), max(a, b, ...), true"
+    "and, or, not, parentheses, abs(a), sqrt(a), min(a, b, ...), max(a, b, ...), "
+    'group("NAME") of the mesh, true'
 )
 MAX_LENGTH = 1000  # characters
 MAX_DEPTH = 40  # levels of the syntax tree; bounds the recursion here and in ast.unparse
 
 Kind = Literal["number", "truth"]
+Members = Callable[[str], NDArray[np.bool_]]  # which points are in a group, by its name; raises InputError
 AXES = {"X": 0, "Y": 1, "Z": 2}
 ARITHMETIC: dict[type[ast.AST], Callable] = {
     ast.Add: operator.add,
@@ -49,13 +57,51 @@ UNARY: dict[str, Callable] = {"abs": np.abs, "sqrt": np.sqrt}
 FOLDED: dict[str, Callable] = {"min": np.minimum, "max": np.maximum}
 
 
-def mask(expression: str, points: Float64) -> NDArray[np.bool_]:
+@dataclass(frozen=True)
+class _Places:
+    """Points (n, 3) [m] and their groups. rows: their numbers among those of `members`, None for all of these."""
+
+    points: Float64
+    members: Members | None = None
+    rows: NDArray[np.integer] | None = None
+
+    def some(self, chosen: NDArray[np.integer]) -> "_Places":
+        return _Places(self.points[chosen], self.members, chosen if self.rows is None else self.rows[chosen])
+
+    def within(self, group: str) -> NDArray[np.bool_]:
+        if self.members is None:
+            raise InputError(f"group({group!r}): there is no mesh with groups here")
+        held = self.members(group)
+        return held.copy() if self.rows is None else held[self.rows]
+
+
+def nodes(expression: str, mesh: "Mesh") -> NDArray[np.bool_]:
+    """Returns the nodes of a mesh that an expression chooses, (n,). Raises InputError as `mask` does."""
+    return mask(expression, mesh.rest, mesh.nodes_of)
+
+
+def elements(expression: str, mesh: "Mesh") -> NDArray[np.bool_]:
+    """Returns the tetrahedra of a mesh that an expression chooses, (m,), by their centroids and groups of elements.
+
+    Raises InputError as `mask` does.
+    """
+    return mask(expression, mesh.centroids, mesh.elements_of)
+
+
+def of_group(name: str, expression: str | None = None) -> str:
+    """Returns the expression that chooses a group, and of it what another expression chooses."""
+    chosen = f"group({json.dumps(name, ensure_ascii=False)})"
+    return chosen if expression is None else f"{chosen} and ({expression})"
+
+
+def mask(expression: str, points: Float64, members: Members | None = None) -> NDArray[np.bool_]:
     """Evaluates `expression` at `points` (n, 3) [m]; returns bool (n,).
 
+    members: of groups; without it there are none
     Raises InputError if the text is not allowed, or if a value in it is not finite at some point.
     """
     try:
-        return _truth(parse(expression), np.asarray(points, dtype=np.float64))
+        return _truth(parse(expression), _Places(np.asarray(points, dtype=np.float64), members))
     except InputError as error:
         raise InputError(f"where = {shortened(expression)}: {error}") from None
 
@@ -66,7 +112,7 @@ def values(expression: str, points: Float64) -> Float64:
     Raises InputError as `mask` does.
     """
     try:
-        return _number(parse(expression, "number"), np.asarray(points, dtype=np.float64))
+        return _number(parse(expression, "number"), _Places(np.asarray(points, dtype=np.float64)))
     except InputError as error:
         raise InputError(f"{shortened(expression)}: {error}") from None
 
@@ -76,7 +122,7 @@ def parse(expression: str, kind: Kind = "truth") -> ast.expr:
     if len(expression) > MAX_LENGTH:
         raise InputError(f"longer than {MAX_LENGTH} characters; {ALLOWED}")
     try:
-        tree = ast.parse(" ".join(expression.split()), mode="eval").body
+        tree = ast.parse(" ".join(expression.splitlines()).strip(), mode="eval").body
     except (SyntaxError, ValueError, RecursionError, MemoryError) as error:
         raise InputError(f"cannot be read ({_reason(error)}); {ALLOWED}") from None
     if _depth(tree) > MAX_DEPTH:
@@ -124,6 +170,10 @@ def _kind(node: ast.expr) -> Kind:
             return _checked("number", [left, right], "number")
         case ast.UnaryOp(op=op, operand=operand) if type(op) in ARITHMETIC:
             return _checked("number", [operand], "number")
+        case ast.Call(func=ast.Name(id="group"), args=[ast.Constant(value=str())], keywords=[]):
+            return "truth"
+        case ast.Call(func=ast.Name(id="group")):
+            raise InputError(f"'{ast.unparse(node)[:60]}': group takes one name in quotes")
         case ast.Call(func=ast.Name(id=name), args=arguments, keywords=[]):
             _check_call(name, len(arguments))
             return _checked("number", arguments, "number")
@@ -168,45 +218,47 @@ def _check_number(value: int | float) -> None:
         raise InputError("a number is too large for 64-bit floats")
 
 
-def _truth(node: ast.expr, points: Float64) -> NDArray[np.bool_]:
+def _truth(node: ast.expr, places: _Places) -> NDArray[np.bool_]:
     match node:
         case ast.BoolOp(op=op, values=[first, *rest]):
-            held = _truth(first, points)
+            held = _truth(first, places)
             for value in rest:
                 undecided = np.flatnonzero(held if isinstance(op, ast.And) else ~held)
-                held[undecided] = _truth(value, points[undecided])
+                held[undecided] = _truth(value, places.some(undecided))
             return held
         case ast.UnaryOp(operand=operand):
-            return ~_truth(operand, points)
+            return ~_truth(operand, places)
         case ast.Compare(left=left, ops=ops, comparators=rest):
-            values = [_number(n, points) for n in (left, *rest)]
+            values = [_number(n, places) for n in (left, *rest)]
             pairs = zip(ops, values, values[1:], strict=False)
             return reduce(np.logical_and, [COMPARISON[type(op)](a, b) for op, a, b in pairs])
-    return np.ones(len(points), dtype=bool)  # true
+        case ast.Call(args=[ast.Constant(value=str() as group)]):
+            return places.within(group)
+    return np.ones(len(places.points), dtype=bool)  # true
 
 
-def _number(node: ast.expr, points: Float64) -> Float64:
+def _number(node: ast.expr, places: _Places) -> Float64:
     match node:
         case ast.Name(id=name):
-            return points[:, AXES[name]]
+            return places.points[:, AXES[name]]
         case ast.Constant(value=value):
-            return np.full(len(points), float(value))  # type: ignore[arg-type]  # parse() let only numbers through
+            return np.full(len(places.points), float(value))  # type: ignore[arg-type]  # parse() let only numbers through
     with np.errstate(all="ignore"):
-        values = _computed(node, points)
+        values = _computed(node, places)
     bad = np.flatnonzero(~np.isfinite(values))
     if bad.size:
-        at = ", ".join(f"{c:.6g}" for c in points[bad[0]])
+        at = ", ".join(f"{c:.6g}" for c in places.points[bad[0]])
         raise InputError(f"'{ast.unparse(node)}' is not a finite number at the point ({at}); {ALLOWED}")
     return values
 
 
-def _computed(node: ast.expr, points: Float64) -> Float64:
+def _computed(node: ast.expr, places: _Places) -> Float64:
     match node:
         case ast.BinOp(left=left, op=op, right=right):
-            return ARITHMETIC[type(op)](_number(left, points), _number(right, points))
+            return ARITHMETIC[type(op)](_number(left, places), _number(right, places))
         case ast.UnaryOp(op=op, operand=operand):
-            return ARITHMETIC[type(op)](_number(operand, points))
+            return ARITHMETIC[type(op)](_number(operand, places))
         case ast.Call(func=ast.Name(id=name), args=arguments):
-            values = [_number(a, points) for a in arguments]
+            values = [_number(a, places) for a in arguments]
             return UNARY[name](values[0]) if name in UNARY else reduce(FOLDED[name], values)
     raise AssertionError(ast.dump(node))  # parse() refused everything else

@@ -60,7 +60,7 @@ def _chosen(simulation: Simulation, body: Body, wanted: pb.Cut) -> Int64:
     if sum(given) != 1:
         raise BadCut("a cut needs one of blade, radius, where and elements")
     if wanted.where:
-        return np.flatnonzero(where.mask(wanted.where, body.centroids))
+        return np.flatnonzero(where.elements(wanted.where, body.mesh))
     if wanted.elements:
         return _listed(body, wanted.elements)
     tets, x = body.mesh.tets, simulation.world.backend.fetch(simulation.world.x)[body.nodes].copy()

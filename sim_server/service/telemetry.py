@@ -99,7 +99,7 @@ class Telemetry:
         """
         message = messages.scene(self.simulation)
         message.server = self.link.name
-        self.link.set_scene(message)
+        self.link.set_scene(messages.published(message))
         if self.recorder:
             self.recorder.scene(message)
         for body in self.simulation.world.bodies:

@@ -12,12 +12,14 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
+from protocol.messages_pb2 import Group as GroupMessage
 from protocol.messages_pb2 import Scene as SceneMessage
 from protocol.messages_pb2 import Topology
 from protocol.refused import Refused
 from protocol.validate import all_finite, array, check_range
 from sim_server.errors import InputError
 from sim_server.mesh import Mesh, check
+from sim_server.mesh.groups import Group
 from sim_server.scene.model import Scene
 from sim_server.simulation import Simulation
 
@@ -36,7 +38,7 @@ class Assembly:
     def __init__(self, scene: SceneMessage, topology: Topology):
         name = topology.header.object
         try:
-            self._simulation = Simulation(single_object_scene(scene.resolved, name, _mesh(topology)))
+            self._simulation = Simulation(single_object_scene(scene.resolved, name, mesh_of_topology(topology)))
         except (InputError, ValidationError) as error:
             raise Refused(f"Scene.resolved, object {name!r}: {error}", "malformed") from error
         self._simulation.engine.begin = ()  # A of a scheme of several steps does not depend on the states before
@@ -95,7 +97,8 @@ def single_object_scene(resolved: str, name: str, mesh: Mesh) -> Scene:
     return scene
 
 
-def _mesh(topology: Topology) -> Mesh:
+def mesh_of_topology(topology: Topology) -> Mesh:
+    """Returns the mesh of an object, before its pose. Raises Refused, InputError."""
     rest = array(topology.reference or topology.rest, np.float64, (topology.nodes, 3), "Topology.rest", finite=True)
     tets = array(topology.tets, np.int32, (-1, 4), "Topology.tets")
     check_range(tets, 0, topology.nodes, "Topology.tets")
@@ -103,4 +106,15 @@ def _mesh(topology: Topology) -> Mesh:
     if topology.quadratic:
         quadratic = array(topology.quadratic, np.int32, (-1, 10), "Topology.quadratic")
         check_range(quadratic, 0, topology.nodes, "Topology.quadratic")
-    return check(Mesh(rest, tets, topology.header.object, quadratic=quadratic))
+    groups = {group.name: _group(group, len(tets), topology.nodes) for group in topology.groups}
+    return check(Mesh(rest, tets, topology.header.object, quadratic=quadratic, groups=groups))
+
+
+def _group(given: GroupMessage, tets: int, nodes: int) -> Group:
+    elements = array(given.elements, np.int32, (-1,), "Group.elements")
+    faces = array(given.faces, np.int32, (-1, 4), "Group.faces")
+    others = array(given.nodes, np.int32, (-1,), "Group.nodes")
+    check_range(elements, 0, tets, "Group.elements")
+    check_range(faces, 0, nodes, "Group.faces")
+    check_range(others, 0, nodes, "Group.nodes")
+    return Group(elements, faces, others)

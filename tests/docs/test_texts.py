@@ -125,8 +125,11 @@ def test_python_of_a_run_without_a_network(monkeypatch: pytest.MonkeyPatch, caps
 @pytest.mark.parametrize(("name", "code"), blocks("toml"))
 def test_scenes_load(name: str, code: str, tmp_path: Path) -> None:
     from sim_server.scene import load
+    from tests.support import organ
 
     assert tomllib.loads(code)
+    if "organ." in code:
+        organ.write(tmp_path)
     (tmp_path / "scene.toml").write_text(code)
     assert load(tmp_path / "scene.toml").objects
 
