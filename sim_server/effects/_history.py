@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: MIT
-"""Materials that remember: common part of prony, plasticity and damage. They are listed beside a law of tetrahedra.
+"""Materials that remember: common part of prony, plasticity, damage and poroelasticity. They are listed beside a law of
+tetrahedra.
 
 What they remember are strains in the turning frame of the element: with the rotation R nearest to F, S = R^T F and
 the strain S - I. A rotation of the body leaves all of it as it is. Their stress T need not be coaxial with S, so that
