@@ -44,7 +44,7 @@ from pydantic import Field
 from sim_server.arrays import Float64
 from sim_server.backends.base import Launch
 from sim_server.backends.energies import ElementEnergies
-from sim_server.effects._base import Effect
+from sim_server.effects._base import Effect, check_beside_law
 from sim_server.effects._history import ParamsWithHistory, TetrahedraWithHistory
 from sim_server.errors import InputError
 from sim_server.mechanics.system import Stencil, System
@@ -74,6 +74,8 @@ class Poroelasticity(TetrahedraWithHistory):
     pressure (n,): at nodes of the scene, before the fluid flows [Pa]. stages: of the flow in a step.
     """
 
+    holds = False
+
     def __init__(self, world: World, listed: list[tuple[Body, Any]]):
         super().__init__(world, listed)
         self.remember(jacobian=1, inner=1)
@@ -98,7 +100,8 @@ class Poroelasticity(TetrahedraWithHistory):
         return np.repeat(values, [len(body.mesh.tets) for body in self.bodies])[self.order]
 
     def join(self, others: Sequence[Effect]) -> None:
-        """It needs no moduli of what is beside it."""
+        """It needs no moduli of what is beside it, but a law."""
+        check_beside_law(self, self.bodies, others)
 
     def _flow_of_nodes(self) -> sp.csr_matrix:
         """Returns the flow out of nodes by the pressures of all, (n, n) [m3/(Pa s)]."""
