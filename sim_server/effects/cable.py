@@ -44,7 +44,15 @@ from sim_server.mechanics.system import Stencil, System
 from sim_server.mechanics.world import Body, World
 from sim_server.scene import Scene
 from sim_server.scene.live import Live
-from sim_server.scene.parameters import NotNegative, Parameters, Positive, Vector, as_tuple, complaint, nothing_beside_tables
+from sim_server.scene.parameters import (
+    NotNegative,
+    Parameters,
+    Positive,
+    Vector,
+    as_tuple,
+    complaint,
+    nothing_beside_tables,
+)
 
 SCOPE = "object"
 TEXT = "effects/cable.cu"

@@ -5,7 +5,6 @@ The tables of a scene and the `Params` of each effect derive from `Parameters`, 
 reported in the same words everywhere, together with the keys that exist.
 """
 
-from collections.abc import Sequence
 from difflib import get_close_matches
 from os.path import isfile
 from pathlib import Path
