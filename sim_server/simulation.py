@@ -392,7 +392,8 @@ def build_effects(scene: Scene, world: World, built: dict[str, Effect] | None = 
         from sim_server.effects._holders import Holders
 
         built["holders"] = Holders(world)
-    for name in sorted({n for o in scene.objects for n in o.effects}):
+    names = {n for o in scene.objects for n in o.effects}
+    for name in sorted(names, key=lambda name: (name == "cutting", name)):  # cutting takes the masses of all others
         variants: dict[str, list[tuple[Body, Any]]] = {}
         for body, params in world.with_effect(name):
             variants.setdefault(params.variant_of(body.elements), []).append((body, params))

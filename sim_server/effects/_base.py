@@ -14,6 +14,7 @@ from sim_server.backends.base import Launch, PendingUpdate
 from sim_server.backends.energies import ElementEnergies
 from sim_server.backends.measured import Measured
 from sim_server.backends.rank_one import RankOne
+from sim_server.errors import InputError
 from sim_server.mechanics.system import Coupled, Stencil, System
 from sim_server.mechanics.world import Body, World
 from sim_server.scene import Scene
@@ -182,6 +183,17 @@ class Effect:
         leaves the velocity as it was.
         """
         return []
+
+
+def check_beside_law(effect: Effect, bodies: Sequence[Body], others: Sequence[Effect]) -> None:
+    """Raises InputError for a body without another effect whose elements hold its parts together, as a law's do."""
+    for body in bodies:
+        beside = [e for e in others if e is not effect and e.name in body.effects and e.elements is not None]
+        if not any(e.holds for e in beside):
+            raise InputError(
+                f"object {body.name!r}, effect {effect.name}: nothing beside it gives the object a shape; list a "
+                "material beside it, as neo_hookean or corotational"
+            )
 
 
 class Build(Protocol):

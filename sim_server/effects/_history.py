@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: MIT
-"""Materials that remember: common part of prony, plasticity and damage. They are listed beside a law of tetrahedra.
+"""Materials that remember: common part of prony, plasticity, damage and poroelasticity. They are listed beside a law of
+tetrahedra.
 
 What they remember are strains in the turning frame of the element: with the rotation R nearest to F, S = R^T F and
 the strain S - I. A rotation of the body leaves all of it as it is. Their stress T need not be coaxial with S, so that
@@ -71,8 +72,9 @@ def beside_corotational(name: str, listed: list[tuple[Body, Any]]) -> None:
 class TetrahedraWithHistory(Tetrahedra):
     """Tetrahedra of all bodies that list an effect with a memory.
 
-    text: path of its kernel text. memory: arrays (k, m) that a step carries on. laws: effects with moduli listed beside
-    it, by index of the body; shear (m,): shear moduli [Pa], once all effects are built.
+    text: path of its kernel text. memory: arrays (k, m) that a step carries on. last (k, m): constants with which the
+    last step ended, for `advance`, which puts those of now in their place: parameters change before it runs. laws:
+    effects with moduli listed beside it, by index of the body; shear (m,): shear moduli [Pa], once all are built.
     """
 
     text = ""
@@ -80,6 +82,7 @@ class TetrahedraWithHistory(Tetrahedra):
     def __init__(self, world: World, listed: list[tuple[Body, Any]]):
         super().__init__(world, listed)
         self.memory: dict[str, Float64] = {}
+        self.last = np.zeros((0, len(self.elements)))
         self.laws: dict[int, list[Effect]] = {body.index: [] for body in self.bodies}
         self.shear = np.zeros(0)
 
@@ -87,6 +90,11 @@ class TetrahedraWithHistory(Tetrahedra):
         """Makes the arrays of the memory, 0 at the start: (rows, m) by name."""
         self.memory = {name: np.zeros((count, len(self.elements))) for name, count in rows.items()}
         self.world.backend.keep(*self.memory.values())
+
+    def remember_constants(self, *constants: Float64) -> None:
+        """Makes `last`, of these constants, (k, m) or (m,) each, one after another."""
+        self.last = np.vstack(constants)
+        self.world.backend.keep(self.last)
 
     def join(self, others: Sequence[Effect]) -> None:
         for body in self.bodies:
@@ -149,6 +157,26 @@ class TetrahedraWithHistory(Tetrahedra):
         return ElementEnergies(launch, self._energy, self.owner)
 
     def rows_of_bodies(self, array: NDArray[Any]) -> Callable[[int], Any] | None:
-        if all(array is not own for own in self.memory.values()):
+        if all(array is not own for own in (*self.memory.values(), self.last)):
             return None
         return lambda body: (slice(None), self.owner == body)
+
+
+class InCorotational(TetrahedraWithHistory):
+    """What takes from the forces of corotational elements.
+
+    No other law with moduli stands beside them: what is taken would be of both, and leave A indefinite.
+    """
+
+    @property
+    def known_to_workers(self) -> bool:
+        return False
+
+    def join(self, others: Sequence[Effect]) -> None:
+        super().join(others)
+        for body in self.bodies:
+            if more := [law.name for law in self.laws[body.index] if law.name != "corotational"]:
+                raise InputError(
+                    f"object {body.name!r}, effect {self.name}: it takes from the forces of corotational elements "
+                    f"alone; {more[0]} cannot stand beside them"
+                )

@@ -44,7 +44,15 @@ from sim_server.mechanics.system import Stencil, System
 from sim_server.mechanics.world import Body, World
 from sim_server.scene import Scene
 from sim_server.scene.live import Live
-from sim_server.scene.parameters import NotNegative, Parameters, Positive, Vector, as_tuple, complaint
+from sim_server.scene.parameters import (
+    NotNegative,
+    Parameters,
+    Positive,
+    Vector,
+    as_tuple,
+    complaint,
+    nothing_beside_tables,
+)
 
 SCOPE = "object"
 TEXT = "effects/cable.cu"
@@ -102,9 +110,7 @@ class Params(Parameters):
     def _one_form(self) -> "Params":
         if (self.path is None) == (not self.tables):
             raise complaint("needs path = ..., or a list of tables with path = ... each")
-        given = [key for key in ("tension", "stiffness", "shortening") if getattr(self, key) is not None]
-        if self.tables is not None and given:
-            raise complaint(f"{given[0]}: stands in the tables of the list")
+        nothing_beside_tables(self)
         if self.tables is None:
             _one_way(self)
         return self
@@ -147,6 +153,8 @@ class Cables(LoadingEffect):
     node (k,): those of the paths; elements (m, 2): every two nodes that couple; state (cables, 4): tension [N], length
     [m], stiffness [N/m] and rate of a step (kernel text)
     """
+
+    holds = False
 
     def __init__(self, world: World, listed: list[tuple[Body, Any]]):
         super().__init__(world)

@@ -113,7 +113,7 @@ class Params(Parameters):
 
     @model_validator(mode="after")
     def _one_form(self) -> "Params":
-        where_or_tables(self, MODES)
+        where_or_tables(self)
         if self.tables is None:
             _one_mode(self)
         return self

@@ -27,11 +27,17 @@ template <class T> INLINE T equivalent(const symmetric6<T>& strain, Moduli<T> c,
     return sqrt(x * x + y * y + z * z);
 }
 
-// limits (2, n): strain at which damage begins, and over which the stress falls to 1 / e.
-template <class P> INLINE local_number damage_of(const P& p, index i, local_number strain) {
-    const local_number first = at_items(p.limits, i), over = larger(strain - first, local_number{});
-    const local_number left = first / (first + over) * exp(-over / at_items(p.limits + p.n, i));
-    return smaller(1 - left, at_items(p.most, i));
+// first, scale: strain at which damage begins, and over which the stress falls to 1 / e.
+template <class T> INLINE T damage_of(T strain, T first, T scale, T most) {
+    const T over = larger(strain - first, T{});
+    return smaller(1 - first / (first + over) * exp(-over / scale), most);
+}
+
+// Damage of an element at a strain, and with what it remembers.
+template <class P> INLINE local_number damage_at(const P& p, index i, local_number strain) {
+    strain = larger(at_items(p.largest, i), strain);
+    const local_number found = damage_of(strain, at_items(p.limits, i), at_items(p.limits + p.n, i), at_items(p.most, i));
+    return larger(at_items(p.least, i), found);
 }
 
 struct DamageHistory {
@@ -43,16 +49,30 @@ struct DamageHistory {
     const int* watched;      // (n,) a node of the element's body that is free unless the body is frozen
     const local* lame;       // (n,) lambda [Pa]
     const local* shear;      // (n,) mu [Pa]
+    const local* limits;     // (2, n) strain at which damage begins, and over which the stress falls to 1 / e
+    const local* most;       // (n,) largest damage
     int tension;             // 1: principal strains above 0 count, 0: the energy
+    local* last;             // (4, n) in, out: limits, lambda and mu with which the last step ended, as they are now
     local* largest;          // (1, n) in, out: largest equivalent strain so far
+    local* least;            // (1, n) in, out: damage so far where the limits have changed since
 };
 
 // Once a step.
 KERNEL(advance, DamageHistory) {
     typedef local_number T;
     index tet[4];
-    const T before = at_items(p.largest, i), now = equivalent(turned_element_at(p, i, tet).strain, moduli_at(p, i), p.tension);
-    put(p.largest, i, is_live(p, i) ? larger(before, now) : before);
+    const long long n = p.n;
+    const T first = at_items(p.last, i), scale = at_items(p.last + n, i), first_now = at_items(p.limits, i), scale_now = at_items(p.limits + n, i);
+    const Moduli<T> c = {at_items(p.last + 2 * n, i), at_items(p.last + 3 * n, i)}, c_now = moduli_at(p, i);
+    const T before = at_items(p.largest, i), now = equivalent(turned_element_at(p, i, tet).strain, c, p.tension);
+    const T largest = is_live(p, i) ? larger(before, now) : before, least = at_items(p.least, i);
+    auto changed = (first != first_now) | (scale != scale_now);
+    put(p.largest, i, largest);
+    put(p.least, i, changed ? larger(least, damage_of(largest, first, scale, at_items(p.most, i))) : least);
+    put(p.last, i, first_now);
+    put(p.last + n, i, scale_now);
+    put(p.last + 2 * n, i, c_now.lambda);
+    put(p.last + 3 * n, i, c_now.mu);
 }
 
 struct DamageElements {
@@ -64,12 +84,13 @@ struct DamageElements {
     const local* volume;                 // (n,) [m3]
     const local* lame;                   // (n,) [Pa]
     const local* shear;                  // (n,) [Pa]
-    const local* limits;                 // (2, n)
+    const local* limits;                 // (2, n) as above
     const local* most;                   // (n,) largest damage
     int tension;
     local h;                             // factor of the force [s]
     const local* stiffness_coefficient;  // (n,) factor of the tangent [s2]
     const local* largest;                // (1, n) largest equivalent strain as the step began
+    const local* least;                  // (1, n) damage that there is whatever the strain
     local* corners;                      // (4, n, 9) out: h f_a - factor (K v)_a [N s], upper triangle of factor K_aa [kg]
     local* edges;                        // (6, n, 9) out: factor K_ab, a < b [kg]
 };
@@ -82,7 +103,7 @@ KERNEL(elements, DamageElements) {
     TurnedElement<T> e = turned_element_at(p, i, tet);
     field_edges(p.v, tet, v);
     Moduli<T> c = moduli_at(p, i);
-    const T damage = damage_of(p, i, larger(at_items(p.largest, i), equivalent(e.strain, c, p.tension)));
+    const T damage = damage_at(p, i, equivalent(e.strain, c, p.tension));
     const T lost = -damage * at_items(p.volume, i), factor = lost * at_items(p.stiffness_coefficient, i);
     symmetric6<T> stress = e.strain;
     UNROLL for (int k = 0; k < 6; ++k) stress.m[k] *= 2 * p.h * lost * c.mu;
@@ -105,6 +126,7 @@ struct DamageEnergy {
     const local* most;       // (n,)
     int tension;
     const local* largest;    // (1, n)
+    const local* least;      // (1, n)
     local* energy;           // (n,) out: -V damage (mu |strain|^2 + lambda / 2 tr(strain)^2) at the end of the step [J]
 };
 
@@ -113,6 +135,6 @@ KERNEL(energy, DamageEnergy) {
     index tet[4];
     symmetric6<T> strain = turned_element_at(p, i, tet).strain;
     Moduli<T> c = moduli_at(p, i);
-    T damage = damage_of(p, i, larger(at_items(p.largest, i), equivalent(strain, c, p.tension)));
+    T damage = damage_at(p, i, equivalent(strain, c, p.tension));
     put(p.energy, i, -(local)0.5 * at_items(p.volume, i) * damage * twice_energy(strain, c));
 }

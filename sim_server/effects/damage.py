@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
 """Damage of corotational tetrahedra, listed beside `corotational`: tissue that tears, concrete, glue, plaster.
 
-A scalar d from 0 (sound) to `most` takes from the elastic stress; it never heals. With the strain in the turning frame
-of the element and its largest equivalent strain k so far::
+A scalar d from 0 (sound) to `most` takes from the elastic stress; it never heals, nor by live parameters. With the
+strain in the turning frame of the element and its largest equivalent strain k so far::
 
     T = (1 - d) C strain,   d = 1 - (k0 / k) exp(-(k - k0) / kf) where k > k0, at most `most`
 
@@ -35,17 +35,18 @@ J/m2. Strains are linear: good to about 10-20 %; beyond that, as in torn element
 Source: Mazars 1984; Kachanov 1958; Bazant and Oh, Crack band theory for fracture of concrete, 1983; Oliver 1989.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Annotated, Any, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field, create_model
 
 from sim_server.arrays import Float64
 from sim_server.backends.base import Launch
 from sim_server.backends.energies import ElementEnergies
 from sim_server.effects._base import Effect
-from sim_server.effects._history import ParamsWithHistory, TetrahedraWithHistory, beside_corotational
+from sim_server.effects._history import InCorotational, ParamsWithHistory, beside_corotational
 from sim_server.effects._hyperelastic import Constant, Law
 from sim_server.errors import InputError
 from sim_server.mechanics.system import Stencil, System
@@ -82,27 +83,29 @@ Params = create_model(
 )  # fmt: skip
 
 
-class Damage(TetrahedraWithHistory):
-    """memory: largest (1, m), the largest equivalent strain. lame (m,): lambda [Pa]; limits (2, m): k0, kf."""
+class Damage(InCorotational):
+    """memory: largest (1, m), the largest equivalent strain. lame (m,): lambda [Pa]; limits (2, m): k0, kf.
+
+    last: limits, lame, shear. least (1, m): damage under limits of before, which stays.
+    """
 
     text = "effects/damage.cu"
 
     def __init__(self, world: World, listed: list[tuple[Body, Any]]):
         super().__init__(world, listed)
         self.remember(largest=1)
+        self.least = np.zeros((1, len(self.elements)))
+        world.backend.keep(self.least)
         self.tension = int(listed[0][1].measure == "tension")
         counts = [len(body.mesh.tets) for body in self.bodies]
         self.most = np.repeat([params.most for _, params in listed], counts)[self.order]
         self.lame, self.limits = np.zeros(0), np.zeros((2, 0))
 
-    @property
-    def known_to_workers(self) -> bool:
-        return False
-
     def join(self, others: Sequence[Effect]) -> None:
         super().join(others)
         self.lame = self.world.follow("corotational", compute=lambda scene: self.elasticity(scene)[0])
         self.limits = self.world.follow("damage", "corotational", "growth", compute=self._limits)
+        self.remember_constants(self.limits, self.lame, self.shear)
 
     def _limits(self, scene: Scene) -> Float64:
         lam, mu = self.elasticity(scene)
@@ -122,10 +125,14 @@ class Damage(TetrahedraWithHistory):
 
     @property
     def _constants(self) -> dict[str, Any]:
-        return {"lame": self.lame, "limits": self.limits, "most": self.most, "tension": self.tension}
+        limits = {"limits": self.limits, "most": self.most, "least": self.least}
+        return {"lame": self.lame, "tension": self.tension, **limits}
+
+    def rows_of_bodies(self, array: NDArray[Any]) -> Callable[[int], Any] | None:
+        return super().rows_of_bodies(self.memory["largest"] if array is self.least else array)
 
     def history(self) -> list[Launch]:
-        return self.advance(shear=self.shear, lame=self.lame, tension=self.tension)
+        return self.advance(shear=self.shear, **self._constants, last=self.last)
 
     def launches(self, system: System, stencil: Stencil | None, accumulate: bool) -> list[Launch]:
         assert stencil is not None
@@ -140,8 +147,10 @@ class Damage(TetrahedraWithHistory):
     def damage(self) -> Float64:
         """Damage of each element as the last step began, (m,), in the order of `number` and `owner`."""
         first, scale = self.limits
-        over = np.maximum(self.world.backend.fetch(self.memory["largest"])[0] - first, 0)
-        return np.asarray(np.minimum(1 - first / (first + over) * np.exp(-over / scale), self.most))
+        largest, least = (self.world.backend.fetch(array)[0] for array in (self.memory["largest"], self.least))
+        over = np.maximum(largest - first, 0)
+        found = np.minimum(1 - first / (first + over) * np.exp(-over / scale), self.most)
+        return np.asarray(np.maximum(found, least))
 
 
 def build(world: World, listed: list[tuple[Body, Any]]) -> Damage:

@@ -77,6 +77,8 @@ Params = LAW.parameters()
 class Fibres(Tetrahedra):
     """constants (2, m) and directions (6, m), as the kernel text has them."""
 
+    holds = False
+
     def __init__(self, world: World, listed: list[tuple[Body, Any]]):
         super().__init__(world, listed)
         self.constants = self.packed(LAW)

@@ -78,7 +78,7 @@ class Params(Parameters):
 
     @model_validator(mode="after")
     def _one_form(self) -> "Params":
-        where_or_tables(self, ["along"])
+        where_or_tables(self)
         return self
 
     @property

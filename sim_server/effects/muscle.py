@@ -35,6 +35,7 @@ Sources: Zajac, Muscle and tendon, Critical Reviews in Biomedical Engineering 17
 Blemker, Pinsky and Delp, A 3D model of muscle, Journal of Biomechanics 38, 2005 (active stress in a continuum).
 """
 
+from collections.abc import Sequence
 from typing import Annotated, Any
 
 import numpy as np
@@ -43,9 +44,9 @@ from pydantic import AfterValidator, Field
 from sim_server.arrays import Float64
 from sim_server.backends.base import Launch
 from sim_server.backends.energies import ElementEnergies
+from sim_server.effects._base import Effect, check_beside_law
 from sim_server.effects._hyperelastic import Constant, Law, Tetrahedra
 from sim_server.effects._loads import LoadingEffect
-from sim_server.errors import InputError
 from sim_server.mechanics.system import Stencil, System
 from sim_server.mechanics.world import Body, World
 from sim_server.scene import Scene
@@ -53,9 +54,6 @@ from sim_server.scene.live import Live
 from sim_server.scene.parameters import NotNegative, Vector, complaint
 
 SCOPE = "object"
-ALONE = {  # beside these alone it would have no shape
-    "buoyancy", "cable", "cavity", "fibres", "fixed", "growth", "muscle", "rayleigh", "touch", "traction", "wind",
-}  # fmt: skip
 
 
 def _not_zero(direction: tuple[float, float, float]) -> tuple[float, float, float]:
@@ -100,6 +98,8 @@ Params = LAW.parameters()
 class Muscle(Tetrahedra, LoadingEffect):
     """constants (7, m) and directions (3, m), as the kernel text has them; forces (4, m, 3): of corners [N]."""
 
+    holds = False
+
     def __init__(self, world: World, listed: list[tuple[Body, Any]]):
         Tetrahedra.__init__(self, world, listed)
         LoadingEffect.__init__(self, world)
@@ -108,6 +108,9 @@ class Muscle(Tetrahedra, LoadingEffect):
         self.forces = np.zeros((4, len(self.elements), 3))
         world.backend.keep(self.forces)
         self._beats = world.at_start(self._beating)
+
+    def join(self, others: Sequence[Effect]) -> None:
+        check_beside_law(self, self.bodies, others)
 
     def _directions(self, scene: Scene) -> Float64:
         directions = np.concatenate([v["direction"] for v in self.values_in(scene, LAW)])[self.order]
@@ -141,11 +144,5 @@ class Muscle(Tetrahedra, LoadingEffect):
 
 
 def build(world: World, listed: list[tuple[Body, Any]]) -> Muscle:
-    """The fibres; raises InputError for an element in no region, or a body that lists no material beside them."""
-    for body, _ in listed:
-        if set(body.effects) <= ALONE:
-            raise InputError(
-                f"object {body.name!r}, effect muscle: it pulls along its fibres alone; list a material beside it, as "
-                "neo_hookean or corotational"
-            )
+    """The fibres; raises InputError for an element in no region."""
     return Muscle(world, listed)

@@ -39,6 +39,7 @@ struct PlasticHistory {
     const int* watched;      // (n,) a node of the element's body that is free unless the body is frozen
     const local* shear;      // (n,) mu [Pa]
     const local* constants;  // (3, n) [Pa]
+    local* last;             // (4, n) in, out: constants and mu with which the last step ended, as they are now [Pa]
     local* plastic;          // (6, n) in, out: plastic strain
     local* hardened;         // (1, n) in, out: equivalent plastic strain
 };
@@ -47,10 +48,16 @@ struct PlasticHistory {
 KERNEL(advance, PlasticHistory) {
     typedef local_number T;
     index tet[4];
+    const long long n = p.n;
     T constants[3], hardened = at_items(p.hardened, i);
-    constants_at(p, i, constants);
+    const T mu = at_items(p.last + 3 * n, i);
+    UNROLL for (int k = 0; k < 3; ++k) {
+        constants[k] = at_items(p.last + k * n, i);
+        put(p.last + k * n, i, at_items(p.constants + k * n, i));
+    }
+    put(p.last + 3 * n, i, at_items(p.shear, i));
     symmetric6<T> plastic = symmetric_at(p.plastic, p.n, i);
-    Flow<T> f = flow_to(deviator(turned_element_at(p, i, tet).strain), plastic, hardened, at_items(p.shear, i), constants);
+    Flow<T> f = flow_to(deviator(turned_element_at(p, i, tet).strain), plastic, hardened, mu, constants);
     f.amount = is_live(p, i) ? f.amount : T{};
     flow(f, plastic);
     put_symmetric(p.plastic, p.n, i, plastic);

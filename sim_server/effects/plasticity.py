@@ -33,13 +33,15 @@ Source: Simo and Hughes, Computational Inelasticity, 1998, section 3.3; Simo and
 for rate-independent elastoplasticity, 1985.
 """
 
+from collections.abc import Sequence
 from typing import Any
 
 from pydantic import create_model
 
 from sim_server.backends.base import Launch
 from sim_server.backends.energies import ElementEnergies
-from sim_server.effects._history import ParamsWithHistory, TetrahedraWithHistory, beside_corotational
+from sim_server.effects._base import Effect
+from sim_server.effects._history import InCorotational, ParamsWithHistory, beside_corotational
 from sim_server.effects._hyperelastic import Constant, Law
 from sim_server.mechanics.system import Stencil, System
 from sim_server.mechanics.world import Body, World
@@ -59,8 +61,8 @@ LAW = Law(
 Params = create_model("Params of plasticity", __base__=(LAW.parameters(), ParamsWithHistory))
 
 
-class Plasticity(TetrahedraWithHistory):
-    """memory: plastic (6, m), the plastic strain; hardened (1, m), the equivalent one."""
+class Plasticity(InCorotational):
+    """memory: plastic (6, m), the plastic strain; hardened (1, m), the equivalent one. last: constants, shear."""
 
     text = "effects/plasticity.cu"
 
@@ -69,12 +71,12 @@ class Plasticity(TetrahedraWithHistory):
         self.remember(plastic=6, hardened=1)
         self.constants = self.packed(LAW)
 
-    @property
-    def known_to_workers(self) -> bool:
-        return False
+    def join(self, others: Sequence[Effect]) -> None:
+        super().join(others)
+        self.remember_constants(self.constants, self.shear)
 
     def history(self) -> list[Launch]:
-        return self.advance(shear=self.shear, constants=self.constants)
+        return self.advance(shear=self.shear, constants=self.constants, last=self.last)
 
     def launches(self, system: System, stencil: Stencil | None, accumulate: bool) -> list[Launch]:
         assert stencil is not None

@@ -7,24 +7,16 @@ struct PoreMeans {
     const int* start;     // (n + 1,) into elements
     const int* elements;  // (start[n],) those at the node
     const real* share;    // (start[n],) of their values in the mean of the node
+    const real* open;     // (n,) 1, or 0 where it is drained
     const real* field;    // (1, elements)
-    real* mean;           // (n,) out
+    real* mean;           // (n,) out, 0 where it is drained
 };
 
 KERNEL(gather, PoreMeans) {
     real sum = 0;
     for (int k = p.start[i]; k < p.start[i + 1]; ++k) sum += p.share[k] * p.field[p.elements[k]];
-    p.mean[i] = sum;
+    p.mean[i] = p.open[i] * sum;
 }
-
-struct PoreDrain {
-    int n;             // nodes
-    const real* open;  // (n,) 1, or 0 where it is drained
-    const real* mean;  // (n,) pressure of the elements at a node [Pa]
-    real* pressure;    // (n,) out: of the node [Pa]
-};
-
-KERNEL(drain, PoreDrain) { p.pressure[i] = p.open[i] * p.mean[i]; }
 
 // A stage of a Runge-Kutta-Legendre method: mu y[j-1] + nu y[j-2] + step y'[j-1].
 struct PoreStage {

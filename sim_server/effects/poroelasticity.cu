@@ -33,7 +33,7 @@ INLINE number mean_of(const real* field, const index (&tet)[4]) {
 struct PoreRest {
     int n;              // elements
     const int* tets;    // (n, 4) nodes
-    const real* mean;   // (nodes,) of the elements at a node [Pa]
+    const real* mean;   // (nodes,) of the elements at a node, 0 where it is drained [Pa]
     const real* inner;  // (1, n) pressure [Pa]
     real* rest;         // (n,) out: what the means do not have of it [Pa]
 };
@@ -50,18 +50,20 @@ struct PoreSpread {
     const real* pressure;  // (nodes,) before the flow [Pa]
     const real* flowed;    // (nodes,) after it [Pa]
     const real* rest;      // (n,) what the means of nodes do not have of the pressure [Pa]
-    const real* mean;      // (nodes,) of `rest` [Pa]
-    const real* between;   // (n,) part of what both do not have that flows between neighbours in a step
+    const real* mean;      // (nodes,) of `rest`, 0 where it is drained [Pa]
+    const real* between;   // (n,) part of what both do not have that flows in a step, between neighbours and to drained nodes
+    const real* free;      // (nodes,) 1, or 0 at fixed nodes and in a frozen body
+    const int* watched;    // (n,) a node of the element's body that is free unless the body is frozen
     real* inner;           // (1, n) in, out: pressure before and after the flow [Pa]
 };
 
-// Once a step, after the flow between nodes.
+// Once a step, after the flow between nodes; in a frozen body nothing flows.
 KERNEL(spread, PoreSpread) {
     index tet[4];
     get_item_row(p.tets, i, tet);
     const number flow = mean_of(p.flowed, tet) - mean_of(p.pressure, tet);
-    const number blind = at_items(p.rest, i) - mean_of(p.mean, tet);
-    put(p.inner, i, at_items(p.inner, i) + flow - at_items(p.between, i) * blind);
+    const number blind = at_items(p.rest, i) - mean_of(p.mean, tet), before = at_items(p.inner, i);
+    put(p.inner, i, is_live(p, i) ? before + flow - at_items(p.between, i) * blind : before);
 }
 
 // Pressure of an element at J, before the fluid flows [Pa].

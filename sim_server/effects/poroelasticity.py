@@ -44,7 +44,7 @@ from pydantic import Field
 from sim_server.arrays import Float64
 from sim_server.backends.base import Launch
 from sim_server.backends.energies import ElementEnergies
-from sim_server.effects._base import Effect
+from sim_server.effects._base import Effect, check_beside_law
 from sim_server.effects._history import ParamsWithHistory, TetrahedraWithHistory
 from sim_server.errors import InputError
 from sim_server.mechanics.system import Stencil, System
@@ -56,6 +56,7 @@ SCOPE = "object"
 ELEMENTS, FLOW = "effects/poroelasticity.cu", "effects/pore_flow.cu"
 MOST_STAGES = 64
 SAFETY = 0.9  # of the largest stable step of the stages
+SEALED, DRAINED = 10, 3  # rates of what the means at nodes are blind to, over k M / volume^(2/3) of an element [-]
 
 
 class Params(ParamsWithHistory):
@@ -70,8 +71,10 @@ class Params(ParamsWithHistory):
 class Poroelasticity(TetrahedraWithHistory):
     """memory: jacobian (1, m), J at the end of the last step; inner (1, m), the pressure there after the flow [Pa].
 
-    pressure (n,): at nodes of the scene, at the end of the last step [Pa]. stages: of the flow in a step.
+    pressure (n,): at nodes of the scene, before the fluid flows [Pa]. stages: of the flow in a step.
     """
+
+    holds = False
 
     def __init__(self, world: World, listed: list[tuple[Body, Any]]):
         super().__init__(world, listed)
@@ -97,7 +100,8 @@ class Poroelasticity(TetrahedraWithHistory):
         return np.repeat(values, [len(body.mesh.tets) for body in self.bodies])[self.order]
 
     def join(self, others: Sequence[Effect]) -> None:
-        """It needs no moduli of what is beside it."""
+        """It needs no moduli of what is beside it, but a law."""
+        check_beside_law(self, self.bodies, others)
 
     def _flow_of_nodes(self) -> sp.csr_matrix:
         """Returns the flow out of nodes by the pressures of all, (n, n) [m3/(Pa s)]."""
@@ -110,36 +114,40 @@ class Poroelasticity(TetrahedraWithHistory):
         return sp.csr_matrix((entries.ravel(), (rows, columns)), (n, n))
 
     def history(self) -> list[Launch]:
-        w, m, module = self.world, len(self.elements), self.world.backend.module(FLOW)
-        advance = w.backend.module(ELEMENTS).bind(
-            "advance", m, tets=self.elements, x=w.x, gradients=self.gradients, free=w.free, watched=self.watched(),
+        w, m, module = self.world, len(self.elements), self.world.backend.module(ELEMENTS)
+        inner, watched = self.memory["inner"], self.watched()
+        advance = module.bind(
+            "advance", m, tets=self.elements, x=w.x, gradients=self.gradients, free=w.free, watched=watched,
             coupling=self.coupling, **self.memory,
         )  # fmt: skip
-        drain = module.bind("drain", w.nodes, open=self._open, mean=self._mean, pressure=self.pressure)
-        elements, inner = w.backend.module(ELEMENTS), self.memory["inner"]
-        rest = elements.bind("rest_of", m, tets=self.elements, mean=self._mean, inner=inner, rest=self._rest)
-        spread = elements.bind(
+        rest = module.bind("rest_of", m, tets=self.elements, mean=self.pressure, inner=inner, rest=self._rest)
+        spread = module.bind(
             "spread", m, tets=self.elements, pressure=self.pressure, flowed=self._even, rest=self._rest,
-            mean=self._mean, between=self._between(), inner=inner,
+            mean=self._mean, between=self._between(), free=w.free, watched=watched, inner=inner,
         )  # fmt: skip
-        return [advance, self._means(inner), drain, *self._stages(), rest, self._means(self._rest), spread]
+        before, after = self._means(inner, self.pressure), self._means(self._rest, self._mean)
+        return [advance, before, *self._stages(), rest, after, spread]
 
-    def _means(self, field: Float64) -> Launch:
-        """Returns the launch that takes the means of a field of elements at nodes, to `_mean`."""
+    def _means(self, field: Float64, mean: Float64) -> Launch:
+        """Returns the launch that takes the means of a field of elements at nodes, 0 where it is drained."""
         s = self._share
         launch: Launch = self.world.backend.module(FLOW).bind(
-            "gather", self.world.nodes, start=s.indptr, elements=s.indices, share=s.data, field=field, mean=self._mean
-        )
+            "gather", self.world.nodes, start=s.indptr, elements=s.indices, share=s.data, open=self._open, field=field,
+            mean=mean,
+        )  # fmt: skip
         return launch
 
     def _between(self) -> Float64:
-        """Returns the part of a difference of pressures that flows between neighbours in a step, which their means at
-        nodes are blind to: one value for each body, so that no fluid is lost, (m,) [-]."""
+        """Returns the part of a difference of pressures that flows in a step between neighbours, and from elements to
+        drained nodes of theirs, which the means at nodes are blind to: one value for each body, so that no fluid is
+        lost, (m,) [-]. A plate one cell of six tetrahedra thick, drained on both sides, has the slowest rate of its
+        series, pi^2 k M / thickness^2."""
         found = np.zeros(len(self.elements))
         for body in self.bodies:
             own = self.owner == body.index
             rate = (self.mobility * self.storage)[own].mean() / np.cbrt(self.volume[own].mean()) ** 2
-            found[own] = -np.expm1(-10 * self.world.dt * rate)
+            fastest = SEALED if self._open[body.nodes].all() else DRAINED
+            found[own] = -np.expm1(-fastest * self.world.dt * rate)
         return found
 
     def _stages(self) -> list[Launch]:

@@ -42,7 +42,7 @@ from pydantic import BeforeValidator, Field
 from sim_server.arrays import Float64
 from sim_server.backends.base import Launch
 from sim_server.backends.energies import ElementEnergies
-from sim_server.effects._base import Effect, params_in
+from sim_server.effects._base import Effect, check_beside_law, params_in
 from sim_server.effects._history import ParamsWithHistory, TetrahedraWithHistory
 from sim_server.errors import InputError
 from sim_server.mechanics.system import Stencil, System
@@ -76,6 +76,7 @@ class Prony(TetrahedraWithHistory):
     weight, tau (terms, m): of the branches, those of a body with fewer have g = 0.
     """
 
+    holds = False
     text = "effects/prony.cu"
 
     def __init__(self, world: World, listed: list[tuple[Body, Any]]):
@@ -97,6 +98,7 @@ class Prony(TetrahedraWithHistory):
                     f"object {body.name!r}, effect prony: nothing beside it has a shear modulus that g is relative to; "
                     "list a law with moduli, as corotational or neo_hookean, or give shear [Pa]"
                 )
+        check_beside_law(self, self.bodies, others)
 
     def shear_in(self, scene: Scene) -> Float64:
         given = [params.shear for params in params_in(scene, "prony", self.bodies)]
@@ -127,5 +129,5 @@ class Prony(TetrahedraWithHistory):
 
 
 def build(world: World, listed: list[tuple[Body, Any]]) -> Effect:
-    """The branches; raises InputError where nothing beside them has a shear modulus."""
+    """The branches."""
     return Prony(world, listed)

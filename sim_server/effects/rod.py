@@ -48,13 +48,14 @@ from sim_server.mesh import Mesh
 from sim_server.mesh.skin import contained
 from sim_server.scene import Scene
 from sim_server.scene.live import STIFFNESS, Live
-from sim_server.scene.parameters import Parameters, Positive, Vector, as_tuple, complaint
+from sim_server.scene.parameters import Parameters, Positive, Vector, as_tuple, complaint, nothing_beside_tables
 
 SCOPE = "object"
 TEXT, SUMS = "effects/rod.cu", "effects/rod_sums.cu"
 MOST = 1000  # points of a path, and of a rod
 SAMPLES = 200  # of a path, at which the edges of tetrahedra are measured
 STRAIGHT = 1e-9  # |t_k - t_k-1| at rest below which a rod is straight
+SAME = 1e-6  # of the length of edges: points that are nearer to each other are one
 NOTHING = 1e-12  # weight, over the largest one, of a corner that takes no part
 
 
@@ -91,17 +92,21 @@ class Params(Parameters):
     path: Path | None = Field(default=None, description=ABOUT["path"])
     young: Annotated[Positive | None, STIFFNESS] = Field(default=None, description=ABOUT["young"])
     radius: Positive | None = Field(default=None, description=ABOUT["radius"])
-    prestretch: Annotated[Prestretch, Live(0.8, 1.5)] = Field(default=1.0, description=ABOUT["prestretch"])
+    prestretch: Annotated[Prestretch | None, Live(0.8, 1.5)] = Field(default=1.0, description=ABOUT["prestretch"])
     density: Positive | None = Field(default=None, description=ABOUT["density"])
     tables: Annotated[Annotated[tuple[Single, ...], BeforeValidator(as_tuple)] | None, Live()] = Field(
         default=None, description="several rods, each { path, young, radius, ... }"
     )
 
+    @model_validator(mode="before")
+    @classmethod
+    def _none_beside_tables(cls, table: Any) -> Any:
+        """Takes the default of prestretch away where each rod of a list has its own."""
+        return {"prestretch": None} | table if isinstance(table, dict) and table.get("tables") else table
+
     @model_validator(mode="after")
     def _one_form(self) -> "Params":
-        given = [key for key in ("path", "young", "radius", "density") if getattr(self, key) is not None]
-        if self.tables is not None and given:
-            raise complaint(f"{given[0]}: stands in the tables of the list")
+        nothing_beside_tables(self)
         if not self.tables and None in (self.path, self.young, self.radius):
             raise complaint("needs path, young and radius, or a list of tables with these")
         return self
@@ -133,7 +138,8 @@ class Springs(NamedTuple):
 def course(mesh: Mesh, path: Sequence[Sequence[float]]) -> tuple[Float64, Int32, Float64]:
     """Returns the points of a rod (k, 3) [m], the corners (k, 4) of their tetrahedra, and their weights (k, 4).
 
-    Raises InputError for a point of the path that lies outside the object, and a path shorter than the elements.
+    Raises InputError for a point of the path that lies outside the object, for a path that ends where it begins with
+    nothing in between that is farther away than the tetrahedra's edges are long, and for too many points.
     """
     given = np.array(path)
     inside = contained(given, mesh)[2]
@@ -142,7 +148,13 @@ def course(mesh: Mesh, path: Sequence[Sequence[float]]) -> tuple[Float64, Int32,
         raise InputError(f"path: point {int(np.flatnonzero(~inside)[0]) + 1}, ({at}), lies outside the object at rest")
     spacing = _edge_length(mesh, given)
     kept = _apart(given, spacing)
-    pieces = np.maximum(1, np.round(np.linalg.norm(np.diff(kept, axis=0), axis=1) / spacing)).astype(int)
+    apart = np.linalg.norm(np.diff(kept, axis=0), axis=1)
+    if apart.min() < SAME * spacing:
+        raise InputError(
+            f"path: ends where it begins, and no point in between is {spacing:.3g} m away, the length of edges of the "
+            "tetrahedra there; allowed: a longer path, other ends, or a finer mesh"
+        )
+    pieces = np.maximum(1, np.round(apart / spacing)).astype(int)
     if pieces.sum() >= MOST:
         raise InputError(
             f"path: would have {pieces.sum() + 1} points, as far apart as edges of the tetrahedra are long there, "
@@ -248,9 +260,10 @@ class Rods(Effect):
         given = [rod for params in params_in(scene, "rod", self._bodies) for rod in params.rods]
         stiffness, length = [], []
         for rod, part in zip(given, self._parts, strict=True):
-            area, factor = np.pi * rod.radius**2, np.where(part.bends > 0, rod.radius**2 / 4, rod.prestretch)
+            area, prestretch = np.pi * rod.radius**2, rod.prestretch or 1.0
+            factor = np.where(part.bends > 0, rod.radius**2 / 4, prestretch)
             stiffness.append(rod.young * area * factor / part.over)
-            length.append(np.where(part.bends > 0, part.length, part.length / rod.prestretch))
+            length.append(np.where(part.bends > 0, part.length, part.length / prestretch))
         return np.concatenate(stiffness), np.concatenate(length)
 
     def unchangeable(self, scene: Scene) -> Mapping[tuple[int, str], str]:

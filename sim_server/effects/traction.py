@@ -96,7 +96,7 @@ class Params(Parameters):
 
     @model_validator(mode="after")
     def _one_form(self) -> "Params":
-        where_or_tables(self, KINDS)
+        where_or_tables(self)
         if self.tables is None:
             _some_load(self)
         return self

@@ -5,7 +5,6 @@ The tables of a scene and the `Params` of each effect derive from `Parameters`, 
 reported in the same words everywhere, together with the keys that exist.
 """
 
-from collections.abc import Sequence
 from difflib import get_close_matches
 from os.path import isfile
 from pathlib import Path
@@ -94,13 +93,20 @@ def nearest(word: str, known: list[str], what: str) -> str:
     return f"{guess} (known {what}: {', '.join(sorted(known))})"
 
 
-def where_or_tables(params: Any, beside: Sequence[str]) -> None:
-    """Raises unless an effect has either `where` or a list of `tables`, and of `beside` nothing next to the list."""
-    if (params.where is None) == (not params.tables):
+def where_or_tables(params: BaseModel) -> None:
+    """Raises unless an effect has either `where` or a list of `tables`, and nothing next to the list."""
+    given = vars(params)
+    if (given["where"] is None) == (not given["tables"]):
         raise complaint("needs where = ..., or a list of tables with where = ... each")
-    given = [key for key in beside if params.tables is not None and getattr(params, key) is not None]
-    if given:
-        raise complaint(f"{given[0]}: stands in the tables of the list")
+    nothing_beside_tables(params)
+
+
+def nothing_beside_tables(params: BaseModel) -> None:
+    """Raises if an effect has a list of `tables` and, next to it, a key of another value than its default."""
+    given = vars(params)
+    for key, field in type(params).model_fields.items():
+        if given["tables"] is not None and key != "tables" and given[key] not in (None, field.default):
+            raise complaint(f"{key}: stands in the tables of the list")
 
 
 def as_tuple(value: Any) -> Any:

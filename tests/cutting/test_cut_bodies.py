@@ -10,7 +10,7 @@ from sim_server.scene.model import Scene
 from sim_server.simulation import Simulation
 from sim_server.state.start import Start
 from tests.cutting.cut_scenes import HALVED, LAWS, cut, elements, made, table
-from tests.scenes import bar, mesh_file
+from tests.scenes import bar, mesh_file, simulation
 
 NOTCH = "abs(X - 1) < 0.13 and Y > 0.25"
 SCHEMES = {
@@ -46,6 +46,24 @@ def test_what_is_left_moves_as_a_body_without_these_elements(law, tmp_path):
     if law == "corotational":  # frames of others are of all neighbours at rest
         np.testing.assert_allclose(sim.system.rotation[kept], other.system.rotation, atol=1e-6)
     assert np.abs(other.world.x - made(law).world.x[kept]).max() > 0.05, "it moves"
+
+
+def test_a_cut_leaves_the_masses_that_effects_add_to_other_bodies():
+    cut_bar, other = bar((2, 2, 2), name="cut"), bar((2, 2, 2), name="other")
+    cut_bar["effects"]["cutting"] = True
+    capsule = {"young": 1e5, "poisson": 0.3, "thickness": 0.02, "density": 5000}
+    wire = {"path": [[0.1, 0.5, 0.5], [1.9, 0.5, 0.5]], "young": 1e7, "radius": 0.05, "density": 7850}
+    other["effects"] |= {"membrane": capsule, "rod": wire}
+    sim = simulation(cut_bar, other)
+    cut_nodes, nodes = (body.nodes for body in sim.world.bodies)
+    before = sim.world.mass.copy()
+    assert before[nodes].sum() > 1.05 * before[cut_nodes].sum()
+    np.testing.assert_array_equal(sim.world.uncut_mass, before)
+    sim.parameters.set({"cut.cutting.removed": '"3"'})
+    sim.engine.run(1)
+    mass = sim.fetch().mass
+    np.testing.assert_array_equal(mass[nodes], before[nodes])
+    assert mass[cut_nodes].sum() < before[cut_nodes].sum()
 
 
 @pytest.mark.parametrize("scheme", SCHEMES)

@@ -163,6 +163,13 @@ def test_what_draws_it_in_is_work():
     assert records["work"][-1] == pytest.approx(0.5 * 3e4 * 0.05**2, rel=1e-6) and (records["status"] == 0).all()
 
 
+def test_a_cable_holds_no_part_of_a_body():
+    corners = [[2.0 * (k & 1), k >> 1 & 1, k >> 2] for k in range(8)]
+    cable = {"path": corners, "stiffness": 1e3}
+    with pytest.raises(InputError, match="leave 4 of 8 nodes loose"):
+        tied(cable, STATIC, {"where": "X < 0.01"}, cells=(1, 1, 1), young=None)
+
+
 def test_cables_of_a_list_are_live():
     tables = [{"path": AXIS, "tension": 5.0}, {"path": ZIGZAG, "stiffness": 100.0}]
     sim = tied(tables, fixed=[{"where": "X < 0.01"}])

@@ -181,6 +181,8 @@ SOFT = {"scheme": "ros2"}
         ({"where": INSIDE, "pressure": 1.0, "bulk": 1.0}, None, "needs bulk"),
         ({"where": INSIDE, "amount": 1.0}, SOFT, "needs integrator.solve = 'iterate'"),
         ({"pressure": 1.0}, None, "needs where = ..., or a list of tables"),
+        ({"tables": [{"where": INSIDE, "amount": 1.0}], "exponent": 1.4}, None, "exponent: stands in the tables"),
+        ({"tables": [{"where": INSIDE, "pressure": 1.0}], "lids": True}, None, "lids: stands in the tables"),
     ],
 )
 def test_what_is_refused(tmp_path: Path, cavity: Any, integrator: Any, said: str) -> None:

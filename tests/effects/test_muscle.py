@@ -179,8 +179,18 @@ def test_what_is_refused(muscle, said):
         bar_with(muscle)
 
 
-def test_a_muscle_alone_is_refused():
-    with pytest.raises(InputError, match="list a material beside it"):
-        given = bar(young=None)
-        given["effects"] = {"muscle": {"stress": STRESS, "direction": [1, 0, 0]}}
-        Simulation(scene(given))
+MUSCLE = {"muscle": {"stress": STRESS, "direction": [1, 0, 0]}}
+WIRE = {"rod": {"path": [[0.1, 0.5, 0.5], [1.9, 0.5, 0.5]], "young": 1e7, "radius": 0.01}}
+CAPSULE = {"membrane": {"young": 1e5, "poisson": 0.3, "thickness": 0.01}}
+PORES = {"poroelasticity": {"mobility": 1e-9, "storage": 1e5}}
+VISCOUS = {"prony": {"terms": [{"g": 1.0, "tau": 1.0}], "shear": 1e4}}
+
+
+@pytest.mark.parametrize(
+    ("effects", "named"),
+    [(MUSCLE, "muscle"), (MUSCLE | WIRE, "muscle"), (MUSCLE | CAPSULE, "muscle"), (MUSCLE | PORES, "muscle"),
+     (PORES, "poroelasticity"), (VISCOUS | WIRE, "prony")],
+)  # fmt: skip
+def test_what_gives_no_shape_is_refused_without_a_material(effects, named):
+    with pytest.raises(InputError, match=f"'bar', effect {named}: nothing beside it .* list a material beside it"):
+        Simulation(scene(bar((2, 1, 1), young=None, effects=effects)))

@@ -179,6 +179,7 @@ def test_a_body_that_a_rod_is_tied_through_keeps_its_energy(integrator):
 
 def test_rods_of_a_list_keep_their_path():
     sim = with_rod([rod(), rod(ARC)])
+    assert [p.field.short for p in sim.parameters if "rod" in p.field.short] == ["bar.rod.tables"]
     with pytest.raises(BadParameter, match="only young and prestretch"):
         sim.parameters.set({"bar.rod.tables": f"[{{ path = {AXIS}, young = 1e8, radius = 0.01 }}]"})
 
@@ -190,7 +191,9 @@ def test_rods_of_a_list_keep_their_path():
         (rod([[0, 0, 0]]), {}, "has 1 points: must have 2 to 1000"),
         (rod([[0, 0, 0], [0, 0, 0]]), {}, "same point twice"),
         ({"path": AXIS, "young": 1e9}, {}, "needs path, young and radius"),
+        (rod([[1, 0.5, 0.5], [1.2, 0.6, 0.5], [1, 0.5, 0.5]]), {}, "ends where it begins, and no point in between"),
         (rod(tables=[rod()]), {}, "path: stands in the tables"),
+        ({"tables": [rod()], "prestretch": 1.2}, {}, "prestretch: stands in the tables"),
         (rod(prestretch=3.0), {}, "less than or equal to 2"),
         (rod(), {"cutting": {}}, "elements cannot be removed with the effect rod"),
     ],

@@ -85,7 +85,7 @@ CASES = {
                   {"bar.prony.shear": 2e5, "bar.corotational.young": 2e5}, MappingProxyType({}), True),
     "plasticity": Case({"corotational": YOUNG, "plasticity": {"yield_stress": 1e9}},
                        {"bar.plasticity.yield_stress": 700.0, "bar.plasticity.hardening": 1e3,
-                        "bar.plasticity.kinematic": 2e3}),
+                        "bar.plasticity.kinematic": 2e3}, start=True),
     "damage": Case({"corotational": YOUNG, "damage": {"strength": 1e6, "fracture_energy": 1e9}},
                    {"bar.damage.strength": 500.0, "bar.damage.fracture_energy": 100.0}),
     "rayleigh": Case({"corotational": YOUNG, "rayleigh": {"mass": 0.1}},

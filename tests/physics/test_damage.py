@@ -71,6 +71,25 @@ def test_compression_damages_by_energy_alone():
         assert (found > -2.9 * STRENGTH) == damaged
 
 
+@pytest.mark.parametrize(
+    "changed", [{"damage.strength": "1.2e3"}, {"damage.fracture_energy": "1e3"}, {"corotational.young": "5e4"}], ids=str
+)
+def test_damage_does_not_heal_by_live_parameters(changed: dict[str, str]):
+    """Of a strain of the last step or of one long ago."""
+    for steps in (0, 2):
+        sim = cube()
+        sim.engine.run(1)
+        sim.world.x[...] = sim.world.rest * [1 + 3 * FIRST, 1, 1]  # as if the step had ended there
+        known = 1 - np.exp(-2 * FIRST / softening(float(np.cbrt(6 * np.sqrt(2) / 48)))) / 3
+        for _ in range(steps):
+            sim.engine.run(1)
+            sim.world.x[...] = sim.world.rest
+            sim.world.v[...] = 0
+        sim.parameters.set({f"bar.{key}": value for key, value in changed.items()})
+        sim.engine.run(1)
+        np.testing.assert_allclose(sim.effects["damage"].damage, known, rtol=1e-12)
+
+
 def test_damage_is_bounded():
     sim = cube(most=0.8)
     stress_at(sim, 100 * FIRST)
@@ -163,3 +182,7 @@ def test_large_elements_are_refused_and_so_is_plasticity_beside():
         simulation(bar(young=None, effects={"corotational": LAW} | flow))
     with pytest.raises(InputError, match="list corotational beside it"):
         simulation(bar(young=None, effects={"neo_hookean": LAW, "damage": flow["damage"]}))
+    with pytest.raises(InputError, match=r"effect damage: .* alone; mass_spring cannot stand beside them"):
+        simulation(
+            bar(young=None, effects={"corotational": LAW, "mass_spring": {"young": 1e6}, "damage": flow["damage"]})
+        )

@@ -187,11 +187,31 @@ def test_energy_never_grows(scheme: str, linearizations: int):
     assert energies[-1] < 0.9 * energies[0]
 
 
+def test_what_has_flowed_stays_when_parameters_change():
+    """Before the memory has taken the last step up: it flowed under the constants of that step."""
+    flowed = []
+    for changed in ({}, {"plasticity.yield_stress": "1e9"}, {"corotational.young": "1e-3"}):
+        law = {"young": YOUNG, "poisson": POISSON}
+        sim = simulation(
+            bar((1, 1, 1), young=None, effects={"corotational": law, "plasticity": {"yield_stress": 1e-3 * YOUNG}})
+        )
+        sim.engine.run(1)
+        sim.world.x[...] = sim.world.rest * [1.01, 1, 1]  # as if the step had ended there
+        sim.parameters.set({f"bar.{key}": value for key, value in changed.items()})
+        sim.engine.run(1)
+        flowed.append(sim.effects["plasticity"].memory["plastic"].copy())
+    assert flowed[0].max() > 1e-3
+    for other in flowed[1:]:
+        np.testing.assert_array_equal(other, flowed[0])
+
+
 def test_corotational_elements_are_needed_beside():
     flow = {"plasticity": {"yield_stress": 1e3}}
     law = {"young": YOUNG, "poisson": POISSON}
     with pytest.raises(InputError, match=r"object 'bar', effect plasticity: .* list corotational beside it"):
         simulation(bar(young=None, effects={"neo_hookean": law} | flow))
+    with pytest.raises(InputError, match=r"effect plasticity: .* alone; neo_hookean cannot stand beside them"):
+        simulation(bar(young=None, effects={"neo_hookean": law, "corotational": law} | flow))
     with pytest.raises(InputError, match=r"effect plasticity: .* 'qr'"):
         simulation(bar(young=None, effects={"corotational": law | {"rotation": "qr"}} | flow))
 

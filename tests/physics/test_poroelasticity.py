@@ -38,6 +38,34 @@ def test_large_steps_are_stable_and_end_at_the_drained_column() -> None:
     assert np.abs(fluid_of(sim).memory["inner"]).max() < 1e-3 * LOAD
 
 
+@pytest.mark.parametrize(
+    ("cells", "drained", "ways"),
+    [(4, "min(min(X, Y), Z) < 1e-6 or max(max(X, Y), Z) > 0.999", 3), (1, "Z < 1e-6 or Z > 0.999", 1)],
+    ids=["cube", "plate one cell thick"],
+)
+def test_a_body_drains_through_all_of_its_drained_faces(cells: int, drained: str, ways: int) -> None:
+    body = bar((cells, cells, cells), (1, 1, 1), young=1e4, poisson=0, fixed="Z < 0.99 or X > 0.01")
+    body["effects"]["poroelasticity"] = {"mobility": 1e-6, "storage": 1e4, "drained": drained}
+    sim = simulation(body, dt=0.5, preconditioner="block_jacobi")
+    inner = fluid_of(sim).memory["inner"]
+    inner[...] = 1
+    sim.engine.run(20)
+    odd = 2 * np.arange(50) + 1
+    series = np.sum(8 / (np.pi * odd) ** 2 * np.exp(-((np.pi * odd) ** 2) * 1e-2 * 10))
+    assert inner.mean() == pytest.approx(series**ways, rel=0.25)
+
+
+def test_nothing_flows_in_a_frozen_body() -> None:
+    body = bar((2, 1, 1), (0.2, 0.1, 0.1), fixed="X < 0.01")
+    body["effects"]["poroelasticity"] = {"mobility": 1e-7, "storage": 1e6, "drained": "X > 0.19"}
+    sim = simulation(body)
+    inner = fluid_of(sim).memory["inner"]
+    inner[...] = np.arange(inner.size)
+    sim.world.free[...] = 0
+    sim.engine.run(3)
+    np.testing.assert_array_equal(inner[0], np.arange(inner.size))
+
+
 def test_the_fluid_of_a_sealed_body_stays_and_takes_no_momentum() -> None:
     body = bar((3, 2, 2), (0.3, 0.2, 0.2), young=1e4, density=1000)
     body["effects"]["poroelasticity"] = {"mobility": 1e-7, "storage": 2e4, "biot": 0.8}
