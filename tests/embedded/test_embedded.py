@@ -98,7 +98,7 @@ def test_a_scene_of_the_package_is_read_with_other_values():
 
 
 BAD = {
-    "points": (lambda s: wf.Mesh(np.zeros((4, 2)), [[0, 1, 2, 3]]), r"coordinates have shape \(4, 2\): must be \(n, 3\)"),
+    "points": (lambda s: wf.Mesh(np.zeros((4, 2)), [[0, 1, 2, 3]]), r"have shape \(4, 2\): must be \(n, 3\)"),
     "tets": (lambda s: wf.Mesh(GRID.rest, [[0.0, 1, 2, 3]]), r"tets of shape \(1, 4\) and type float64: must be"),
     "a flat one": (lambda s: wf.Mesh([[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]], [[0, 1, 2, 3]]), "mesh arrays: "),
     "a key": (lambda s: wf.Scene({"dt": 0.1, "objekt": []}), "from Python, objekt"),
