@@ -37,6 +37,7 @@ from sim_server.simulation import Simulation
 from sim_server.state import code
 from sim_server.state.start import Start
 from sim_server.updates.factor_source import Inline, Job
+from sim_server.updates.patterns import Patterns
 from sim_server.updates.worker_assembly import Assembly
 
 if TYPE_CHECKING:
@@ -196,7 +197,6 @@ class Replay:
 
     def _library(self) -> Inline:
         """Returns a source of factors that uses the library named in the log, if it is installed."""
-        system = self.simulation.system
         made = [f for o in self.recording.objects.values() for f in o.factors.values()]
         recorded = {f.library for f in made if f.library} - {"native"}  # which is everywhere
         wanted = {_library(name) for name in recorded}
@@ -207,7 +207,7 @@ class Replay:
             self.compared.notes.append(
                 f"factors of the log were made by {', '.join(sorted(recorded))}; here by another"
             )
-        return Inline({b.name: system.body_pattern(b.first, b.last) for b in self.bodies}, choice)
+        return Inline(Patterns.of(self.simulation), choice)
 
     # --- input of a step ----------------------------------------------------------------------------------------
 
@@ -310,7 +310,8 @@ class Replay:
             values = self._assemblies[body.name].matrix(self._positions[body.name])
         use = self.recording.objects[body.name].factors.get(made)
         method = solver.method_named(use.method if use is not None else "")
-        self._inline.submit(Job(body.name, 1, made, warped, values, solver.factor_dtype, method))
+        epoch = self.simulation.epoch(body.name, made)
+        self._inline.submit(Job(body.name, epoch, made, warped, values, solver.factor_dtype, method))
 
     def _collect(self, step: int) -> None:
         for factor in self._inline.poll():

@@ -11,7 +11,8 @@ from protocol import messages_pb2 as pb
 from sim_server.arrays import Float64, Int64
 from sim_server.errors import InputError
 from sim_server.mechanics.cut_shapes import in_sphere, met_by_blade
-from sim_server.mechanics.removal import KEY, numbers_of, removal, removed_from
+from sim_server.mechanics.numbers import numbers_of
+from sim_server.mechanics.removal import KEY, removal, removed_from
 from sim_server.mechanics.world import Body
 from sim_server.mesh.skin import Skin
 from sim_server.network.link import ServerLink

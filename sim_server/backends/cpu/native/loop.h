@@ -187,6 +187,7 @@ struct Loop {
     int32_t launches, before;          // launches; how many of them assemble (the others integrate)
     Launch* launch;
     const Launch* touch;               // pushes and grabs, or null
+    const Launch* spawn;               // begins copies of nodes after parameters have changed, or null
     const int32_t* history;            // numbers of launches that begin every step, once
     int32_t histories;
     int64_t advanced;                  // steps completed when they ran last, -1: they have not
