@@ -79,7 +79,7 @@ class Params(Parameters):
     )
     opened: Annotated[str, AfterValidator(_cuts), Live(listed=False)] = Field(
         default="",
-        description='faces that do not hold elements together, cut after cut: 4 e + k, the k-th of element e, "3 7; 40"',
+        description='faces that hold nothing, cut after cut: 4 e + k for the k-th of element e, such as "3 7-9; 40"',
     )
 
     @model_validator(mode="after")
@@ -170,6 +170,14 @@ class Cutting(Effect):
         split = splitting.of(scene, body.index)
         return faces.surface(present(scene, [body]), split.tets, split.closed)
 
+    def with_copies(self, scene: Scene, x: Float64) -> Float64:
+        """Returns positions (n, 3) in which copies that no step has made yet are where they come from."""
+        assert self.world.splitting is not None
+        origin = self.world.splitting.nodes(scene, "origin")
+        for node in np.flatnonzero((origin >= 0) & (self._origin_before < 0)):  # copies follow what they come from
+            x[node] = x[origin[node]]
+        return x
+
     def check(self, effects: Mapping[str, Effect]) -> None:
         """Raises InputError where another effect would go on as if nothing had been removed."""
         w = self.world
@@ -195,6 +203,8 @@ class Cutting(Effect):
             raise self._refusal(
                 body, f"spare: an object with the effect {wrong[0]} cannot be split; allowed: spare = 0"
             )
+        if body.skin is not None:
+            raise self._refusal(body, "spare: an object with a skin is not split, which would stay whole")
         named = w.at_start(lambda scene: scene.effects)
         if wrong := [name for name in named if not effects[name].splittable(body)]:
             raise self._refusal(body, f"spare: objects of a scene with the effect {wrong[0]} cannot be split")

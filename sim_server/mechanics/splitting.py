@@ -8,6 +8,7 @@ keeps its number in all later ones: the largest group keeps the node, of equal o
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
@@ -67,7 +68,7 @@ class Splitter:
     def __init__(self, name: str, mesh: Mesh, spares: int):
         self.name, self.spares, self.nodes = name, spares, len(mesh.rest)
         self.faces = Faces.of(mesh.tets)
-        inner = (self.faces.owners >= 0).all(axis=1)
+        inner = np.asarray((self.faces.owners >= 0).all(axis=1))
         origin = np.concatenate([np.arange(self.nodes), np.full(spares, -1)]).astype(np.int32)
         self.whole = Split(mesh.tets.astype(np.int32), origin, 0, inner)
         self._face = np.zeros(4 * len(mesh.tets), np.int64)  # of each side
@@ -152,6 +153,11 @@ class Splitter:
         begin = np.flatnonzero(np.concatenate([[True], nodes[1:] != nodes[:-1]]))
         ends = [*begin[1:], len(nodes)]
         return [(int(nodes[a]), members[a:b]) for a, b in zip(begin, ends, strict=True) if b - a > 1]
+
+
+def opening(splitter: Splitter, text: str, faces: Int64) -> dict[str, str]:
+    """Returns the parameter, by its key as TOML, with which these faces are open, too, as one cut more."""
+    return {KEY.format(splitter.name): json.dumps(splitter.opened_by(text, faces))}
 
 
 class Splitting:
