@@ -74,7 +74,6 @@ class Replay:
             ) from error
         self.engine, self.bodies = self.simulation.engine, self.simulation.world.bodies
         self.compared = Comparison(recording)
-        self._same_meshes()
         self._same_obstacles()
         self._taken = {b.name: taken_up(self._rows(b.name), recording.first) for b in self.bodies}
         self._last_use = self._last_uses()
@@ -93,6 +92,7 @@ class Replay:
         self._saved = SavedFactors([], [])
         if recording.checkpoint:
             self._resume(recording)
+        self._same_meshes()
         self._nodes: dict[int, tuple[NDArray[np.int32], Float64]] = {}  # nodes and offsets of interactions, by id
         self._inline = self._library()
         self._positions: dict[str, Float64] = {}  # sent instead of a matrix, and not those of its step, by body
