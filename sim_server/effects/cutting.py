@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: MIT
-"""Elements that are taken out of an object while it moves: by a blade, in a sphere, in a region, or by their numbers.
+"""Elements that are taken out of an object while it moves: by a blade, in a sphere, in a region, or by their numbers;
+and faces between elements that are opened, so that it comes apart there.
 
 What is removed has no stiffness, no mass and no surface from one step to the next: all constants of the element are 0,
 and its nodes lose its part of their masses. What an element's removal opens becomes surface. Pieces that come apart
@@ -13,6 +14,12 @@ Schwarz method; on a CPU, as long as that is cheap) ::
     z1 = S r,   z2 = z1 + P (r - A z1),   z = z2 + S (r - A z2),   S = A_TT^-1 on T, 0 elsewhere
 
 The momentum of what stays is that before the cut. Cuts follow the elements: edges are as rough as the mesh is coarse.
+
+With `spare` nodes a body is split along faces of its elements, too, and loses nothing (mechanics/splitting.py): the
+elements around a node that no longer hang together through faces get a copy of it for each further group, where the
+node is and with its velocity. `opened` are these faces, cut after cut, a live parameter like `removed`; pattern and
+lists of A follow it (mechanics/split_pattern.py). With M the map by which copies move as the nodes that the factor
+knows, M P M^T takes the place of P above.
 
 `removed` is what the scene begins with, and a live parameter: clients cut by `sim-client cut`, which sets it; so cuts
 are logged, replayed, kept by checkpoints, and taken back by a reset.

@@ -40,7 +40,7 @@ class ShapeMatching:
         if splitting is None or not any(body.index in splitting.splitters for body in bodies):
             self.start, self.neighbour, self.arm = world.at_start(self._of)
             return
-        most = len(world.at_start(self._of)[1]) + self._room(splitting)
+        most = self._room(splitting)
         self._last: tuple[Scene, tuple[Int32, Int32, Float64]] | None = None
         self.start, self.neighbour, self.arm = (
             world.follow("cutting", compute=partial(self._followed, part, most)) for part in range(3)
@@ -68,13 +68,13 @@ class ShapeMatching:
         return np.concatenate([found, np.zeros((most - len(found), *found.shape[1:]), found.dtype)])
 
     def _room(self, splitting: Splitting) -> int:
-        """Returns how many neighbours the spare nodes of the bodies may have, and others may have of them: each as
-        many as the nodes of the whole mesh at most have."""
+        """Returns how many neighbours there is room for: those in the whole meshes, and for each spare node twice as
+        many as nodes there at most have, its own and itself as that of others."""
         room = 0
         for body in self._bodies:
-            if splitter := splitting.splitters.get(body.index):
-                start, _ = neighbours(splitter.whole.tets, splitter.nodes, self._level)
-                room += 2 * splitter.spares * int(np.diff(start).max())
+            splitter = splitting.splitters.get(body.index)
+            start, _ = neighbours(body.mesh.tets, len(body.mesh.rest), self._level)
+            room += int(start[-1]) + (2 * splitter.spares * int(np.diff(start).max()) if splitter else 0)
         return room
 
     def launch(self, mean: Float64) -> Launch:

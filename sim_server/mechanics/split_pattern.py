@@ -85,9 +85,11 @@ class FollowedPattern:
         self._world, self._coupled, self._splitting = world, coupled, world.splitting
         self._free = world.free.copy()
         self._last: tuple[Scene, dict[str, NDArray[Any]], list[Stencil]] | None = None
-        n, most = world.nodes, sum(_most_new_blocks(world.splitting, world))
-        self.blocks = len(row) + most
-        self.places = n + 2 * self.blocks
+        others = np.ones(world.nodes, bool)
+        for index in world.splitting.splitters:
+            others[world.bodies[index].nodes] = False
+        self.blocks = int(others[row].sum()) + _room(world.splitting)
+        self.places = world.nodes + 2 * self.blocks
 
     def follow(self) -> tuple[dict[str, Any], list[Stencil]]:
         """Returns the arrays of `System` by name, and the stencils, all of which follow the scene from now on."""
@@ -142,14 +144,17 @@ class FollowedPattern:
         return self._last[1:]
 
 
-def _most_new_blocks(splitting: Splitting, world: World) -> list[int]:
-    """Returns for how many blocks above the diagonal that the spare nodes of each body add there is room: each as many
-    as the nodes of the whole mesh at most have. Only copies beside copies of a node can have more."""
-    found = []
-    for index, splitter in splitting.splitters.items():
-        tets = world.bodies[index].mesh.tets
+def _room(splitting: Splitting) -> int:
+    """Returns for how many blocks above the diagonal of bodies that may be split there is room.
+
+    Those of the whole mesh, and for each spare node as many as the nodes there at most have. Only copies beside copies
+    of a node can have more.
+    """
+    room = 0
+    for splitter in splitting.splitters.values():
+        tets = splitter.whole.tets
         keys = np.unique(np.concatenate([tets[:, a] * np.int64(splitter.nodes) + tets[:, b]
                                          for a in range(4) for b in range(4) if a != b]))  # fmt: skip
         degree = np.bincount(keys // splitter.nodes, minlength=splitter.nodes)
-        found.append(min(splitter.spares * int(degree.max()), 6 * len(tets)))
-    return found
+        room += min(len(keys) // 2 + splitter.spares * int(degree.max()), 6 * len(tets))
+    return room
