@@ -493,6 +493,11 @@ class CpuEngine(Reports):
         self._history = np.array([number[id(launch)] for launch in given.history], np.int32)
         if spawn:
             loop.spawn = c.addressof(self._launch[number[id(spawn)]])
+            blocks = [k for k, launch in enumerate(launches) if launch.domain == "blocks"]
+            self._of_blocks = np.array(blocks, np.int32)
+            loop.of_blocks, loop.blocks_launches = self._of_blocks.ctypes.data, len(blocks)
+            for k in blocks:
+                self._bindings[k].items = (int(arrays["row_start"][nodes]) - nodes) // 2
         loop.history, loop.histories, loop.advanced = self._history.ctypes.data, len(self._history), -1
         self._stages = given.stages and _NativeStages(given.stages, loop, self._launch, number)
         self._euler = given.euler and _NativeEuler(given.euler, loop, self._launch, number)

@@ -24,7 +24,10 @@ static void take_mail(Launch& l, int64_t step) {
 
 static void copy_all(const Loop& loop, const Changes& changes) {
     for (int i = 0; i < changes.count; ++i) std::memcpy(changes.copies[i].target, changes.copies[i].source, changes.copies[i].bytes);
-    if (loop.spawn) run(*loop.spawn, loop.threads);
+    if (!loop.spawn) return;
+    run(*loop.spawn, loop.threads);
+    for (int i = 0; i < loop.blocks_launches; ++i)
+        loop.launch[loop.of_blocks[i]].binding->items = (loop.row_start[loop.nodes] - loop.nodes) / 2;
 }
 
 // Makes the changes of parameters that wait. What they add to the elastic energy of the present state counts as work.
