@@ -15,6 +15,7 @@ from sim_server.mesh.surface import surface_triangles
 from sim_server.parameters import BadParameter
 from sim_server.scene.model import Scene
 from sim_server.scene.where import mask
+from sim_server.service.cuts import BadCut, carry_out
 from sim_server.simulation import Simulation
 from sim_server.state.start import Start
 from sim_server.updates.driver import Driver
@@ -285,6 +286,38 @@ def test_what_cannot_be_split_is_refused(keys, says):
 def test_a_text_that_opens_nothing_is_refused(given, says):
     with pytest.raises(ValueError, match=says):
         made(own={"cutting": given})
+
+
+def blade_at(x, depth):
+    """Swept through y and, from above, z, down to a depth."""
+    return [pb.Vector(x=x, y=y, z=z) for y, z in ((-1, depth), (2, depth), (2, 2), (-1, 2))]
+
+
+def test_clients_split_what_keeps_spare_nodes():
+    """Two cuts in a row, of which the loop takes the second one alone: it finds copies where they will be."""
+    sim, other = made(own=SPARE), made(own=SPARE)
+    for each in (sim, other):
+        each.engine.run(3)
+    replies = []
+    for each in (sim, other):
+        for depth in (0.3, -1):
+            reply = carry_out(each, pb.Cut(object="bar", blade=blade_at(1.02, depth), split=True), "client")
+            replies.append((reply.opened, reply.copied, reply.left, reply.removed))
+            if each is other:
+                each.engine.take_changes()
+    assert replies[:2] == replies[2:] and all(opened > 0 and copied > 0 for opened, copied, *_ in replies)
+    assert replies[0][2:] == (len(sim.world.bodies[0].mesh.tets), 0)
+    again = carry_out(sim, pb.Cut(object="bar", blade=blade_at(1.02, -1), split=True), "client")
+    assert again.opened == again.copied == 0
+    for each in (sim, other):
+        each.engine.run(5)
+    assert np.array_equal(sim.fetch().x, other.fetch().x)
+    found = sim.world.splitting.of(sim.parameters.scene, 0)
+    assert components(found.tets, len(found.origin)) == 2
+    with pytest.raises(BadCut, match="one of blade, radius, where and elements"):
+        carry_out(sim, pb.Cut(object="bar", split=True), "client")
+    with pytest.raises(BadCut, match=r"add spare to its effect cutting, as cutting = \{ spare = 1000 \}"):
+        carry_out(made(), pb.Cut(object="bar", where="X > 1", split=True), "client")
 
 
 MESH = bar((4, 3, 3), (1.0, 0.8, 0.7))

@@ -152,11 +152,3 @@ def test_splits_are_in_the_log_and_repeated_bit_for_bit(tmp_path: Path) -> None:
             edges = frame.x[mesh.tets[:, 1:]] - frame.x[mesh.tets[:, :1]]
             assert (np.linalg.det(edges) > 0).all() and len(mesh.rest) == len(frame.x), "copies are where they belong"
     assert replayed(log, 0)["same"]
-
-
-def test_an_object_without_spare_nodes_is_not_split(tmp_path: Path) -> None:
-    def refused(client: Client) -> None:
-        with pytest.raises(BadInput, match=r"cutting = \{ spare = 1000 \}"):
-            client.cut("beam", where="Z > 2", split=True)
-
-    recorded(tmp_path, touch=refused, effects="cutting = true\n")
