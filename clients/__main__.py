@@ -311,17 +311,22 @@ def cut(
     ] = None,
     where: Annotated[str | None, typer.Option(metavar="EXPRESSION", help="In X, Y, Z of centroids at rest.")] = None,
     elements: Annotated[str | None, typer.Option(metavar="NUMBERS", help='Of the mesh, from 0, as "3 7-9 12".')] = None,
+    split: Annotated[
+        bool, typer.Option("--split", help="Removes none: opens faces along the blade, or around the elements.")
+    ] = False,
     as_json: Json = False,
     connect: Connect = None,
     server: Server = SERVER_NAME,
 ) -> None:
     """Remove elements of an object that lists the effect cutting: what a blade meets, a sphere, a region, by number.
 
-    A blade and a sphere are where the object is now. `sim-client reset` puts all back.
+    A blade and a sphere are where the object is now. `sim-client reset` puts all back. With --split the object is split
+    along faces of its elements and loses nothing; it must list cutting = { spare = N }.
 
     \b
     Examples:
       sim-client cut --object liver --blade "0 0 0, 0.1 0 0, 0.1 0.1 0, 0 0.1 0"
+      sim-client cut --object liver --split --blade "0 0 0, 0.1 0 0, 0.1 0.1 0, 0 0.1 0"
       sim-client cut --object beam --sphere 0.5 0.5 4 0.3
       sim-client cut --object beam --where "abs(Z - 2) < 0.1 and Y > 0.5"
     """
@@ -336,8 +341,14 @@ def cut(
             radius=radius,
             where=where or "",
             elements=elements or "",
+            split=split,
         )
-    if as_json:
+    if split:
+        print(
+            json.dumps({"opened": reply.opened, "copied": reply.copied}) if as_json
+            else f"{reply.opened} faces opened, {reply.copied} nodes copied"
+        )  # fmt: skip
+    elif as_json:
         print(json.dumps({"removed": reply.removed, "left": reply.left}))
     else:
         print(f"{reply.removed} elements removed, {reply.left} left")

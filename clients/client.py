@@ -174,9 +174,11 @@ class Client:
 
     def cut(
         self, object: str, *, blade: Sequence[Point] | None = None, center: Point | None = None, radius: float = 0.0,
-        where: str = "", elements: str = "",
+        where: str = "", elements: str = "", split: bool = False,
     ) -> pb.Reply:  # fmt: skip
         """Removes elements of an object that lists the effect cutting; the reply has how many, and how many are left.
+        With split it removes none: it opens the faces between elements along the blade, or around those that the others
+        name, and the reply has how many faces it opened and how many nodes it copied.
 
         blade: 3 or 4 corners of the surface that a blade sweeps [m]: elements that it meets now. center, radius: those
         with centroids in this sphere now [m]. where: expression in X, Y, Z at rest. elements: numbers, as "3 7-9 12".
@@ -184,7 +186,7 @@ class Client:
 
         >>> client.cut("liver", blade=[(0, 0, 0), (0.1, 0, 0), (0.1, 0.1, 0), (0, 0.1, 0)])
         """
-        wanted = pb.Cut(object=object, radius=number(radius, "radius"), where=where, elements=elements)
+        wanted = pb.Cut(object=object, radius=number(radius, "radius"), where=where, elements=elements, split=split)
         wanted.blade.extend(vector(corner, "blade") for corner in blade or ())
         if center is not None:
             wanted.center.CopyFrom(vector(center, "center"))

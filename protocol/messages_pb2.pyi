@@ -590,20 +590,22 @@ class FactorUse(_message.Message):
     def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., step: _Optional[int] = ..., pattern: _Optional[int] = ..., checksum: _Optional[int] = ..., dtype: _Optional[str] = ..., worker: _Optional[str] = ..., library: _Optional[str] = ..., threads: _Optional[int] = ..., seconds: _Optional[float] = ..., remedy: _Optional[str] = ..., method: _Optional[str] = ..., ahead: _Optional[float] = ..., later: _Optional[bool] = ...) -> None: ...
 
 class Cut(_message.Message):
-    __slots__ = ("object", "blade", "center", "radius", "where", "elements")
+    __slots__ = ("object", "blade", "center", "radius", "where", "elements", "split")
     OBJECT_FIELD_NUMBER: _ClassVar[int]
     BLADE_FIELD_NUMBER: _ClassVar[int]
     CENTER_FIELD_NUMBER: _ClassVar[int]
     RADIUS_FIELD_NUMBER: _ClassVar[int]
     WHERE_FIELD_NUMBER: _ClassVar[int]
     ELEMENTS_FIELD_NUMBER: _ClassVar[int]
+    SPLIT_FIELD_NUMBER: _ClassVar[int]
     object: str
     blade: _containers.RepeatedCompositeFieldContainer[Vector]
     center: Vector
     radius: float
     where: str
     elements: str
-    def __init__(self, object: _Optional[str] = ..., blade: _Optional[_Iterable[_Union[Vector, _Mapping]]] = ..., center: _Optional[_Union[Vector, _Mapping]] = ..., radius: _Optional[float] = ..., where: _Optional[str] = ..., elements: _Optional[str] = ...) -> None: ...
+    split: bool
+    def __init__(self, object: _Optional[str] = ..., blade: _Optional[_Iterable[_Union[Vector, _Mapping]]] = ..., center: _Optional[_Union[Vector, _Mapping]] = ..., radius: _Optional[float] = ..., where: _Optional[str] = ..., elements: _Optional[str] = ..., split: _Optional[bool] = ...) -> None: ...
 
 class Command(_message.Message):
     __slots__ = ("header", "client", "verb", "interaction", "secret", "target", "parameters", "object", "steps", "worker", "cut")
@@ -632,7 +634,7 @@ class Command(_message.Message):
     def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., client: _Optional[str] = ..., verb: _Optional[str] = ..., interaction: _Optional[_Union[Interaction, _Mapping]] = ..., secret: _Optional[bytes] = ..., target: _Optional[_Union[ObstacleTarget, _Mapping]] = ..., parameters: _Optional[_Iterable[_Union[Parameter, _Mapping]]] = ..., object: _Optional[str] = ..., steps: _Optional[int] = ..., worker: _Optional[str] = ..., cut: _Optional[_Union[Cut, _Mapping]] = ...) -> None: ...
 
 class Reply(_message.Message):
-    __slots__ = ("header", "error", "interaction", "status", "unchanged", "parameters", "worker", "removed", "left")
+    __slots__ = ("header", "error", "interaction", "status", "unchanged", "parameters", "worker", "removed", "left", "opened", "copied")
     HEADER_FIELD_NUMBER: _ClassVar[int]
     ERROR_FIELD_NUMBER: _ClassVar[int]
     INTERACTION_FIELD_NUMBER: _ClassVar[int]
@@ -642,6 +644,8 @@ class Reply(_message.Message):
     WORKER_FIELD_NUMBER: _ClassVar[int]
     REMOVED_FIELD_NUMBER: _ClassVar[int]
     LEFT_FIELD_NUMBER: _ClassVar[int]
+    OPENED_FIELD_NUMBER: _ClassVar[int]
+    COPIED_FIELD_NUMBER: _ClassVar[int]
     header: Header
     error: str
     interaction: Interaction
@@ -651,7 +655,9 @@ class Reply(_message.Message):
     worker: str
     removed: int
     left: int
-    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., error: _Optional[str] = ..., interaction: _Optional[_Union[Interaction, _Mapping]] = ..., status: _Optional[_Union[Status, _Mapping]] = ..., unchanged: _Optional[bool] = ..., parameters: _Optional[_Iterable[_Union[LiveParameter, _Mapping]]] = ..., worker: _Optional[str] = ..., removed: _Optional[int] = ..., left: _Optional[int] = ...) -> None: ...
+    opened: int
+    copied: int
+    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., error: _Optional[str] = ..., interaction: _Optional[_Union[Interaction, _Mapping]] = ..., status: _Optional[_Union[Status, _Mapping]] = ..., unchanged: _Optional[bool] = ..., parameters: _Optional[_Iterable[_Union[LiveParameter, _Mapping]]] = ..., worker: _Optional[str] = ..., removed: _Optional[int] = ..., left: _Optional[int] = ..., opened: _Optional[int] = ..., copied: _Optional[int] = ...) -> None: ...
 
 class Parameter(_message.Message):
     __slots__ = ("key", "value")

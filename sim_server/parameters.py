@@ -90,11 +90,13 @@ class LiveParameters:
 
     scene: the scene with the values that were set last
     on_set: called with each update that was given to the loop
+    before_loop: called with each update, and the scene with it, before the loop can take it up
     """
 
     def __init__(self, simulation: Simulated):
         self._simulation, self.scene = simulation, simulation.scene
         self.on_set: list[Callable[[ParameterUpdate], None]] = []
+        self.before_loop: list[Callable[[ParameterUpdate, Scene], None]] = []
         self._start = {field.key: field.value for field in live_fields(self.scene)}
         self._taken = self.scene  # with the values that the loop has if it does not take up what waits
         self._waiting: dict[int, StagedChange] = {}  # by id of the array: what the loop was given last
@@ -267,6 +269,8 @@ class LiveParameters:
             self._first = update  # before the loop may take it up
         tables = {f.of for f in news}
         follow = [id(a.array) for a in self._simulation.world.live_arrays if tables & set(a.of)]
+        for note in self.before_loop:
+            note(update, self.scene)
         update.pending = self._simulation.engine.change([self._waiting[k] for k in dict.fromkeys(follow)])
 
     def _described(self, field: LiveField) -> LiveParameter:

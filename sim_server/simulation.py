@@ -33,6 +33,7 @@ from sim_server.mechanics.energy import collected_energies
 from sim_server.mechanics.halving import check_memory, halving, time_steps
 from sim_server.mechanics.rosenbrock import RosenbrockIntegrator, make_integrator
 from sim_server.mechanics.shape_matching import ShapeMatching
+from sim_server.mechanics.split_history import SplitHistory
 from sim_server.mechanics.static_check import check_held
 from sim_server.mechanics.system import Stencil, System
 from sim_server.mechanics.ties import make_ties, ties_alone
@@ -73,6 +74,10 @@ class Simulation:
         with backend.building():
             self._build(backend, watched)
         self.parameters = LiveParameters(self)
+        self.splits: SplitHistory | None = None
+        if self.system.followed is not None:
+            self.splits = SplitHistory(self.system)
+            self.parameters.before_loop.append(self.splits.on_set)
 
     def make_backend(self, device: str) -> Backend:
         """Returns the place where the kernels of this scene run."""
@@ -289,6 +294,11 @@ class Simulation:
     def cutting(self) -> "Cutting | None":
         """Elements that are removed, if the scene lists it."""
         return cast("Cutting | None", self.effects.get("cutting"))
+
+    def epoch(self, name: str, step: int) -> int:
+        """Returns the epoch of an object in the matrix assembled after `step` completed steps: one more with each time
+        that it was split."""
+        return 1 if self.splits is None else self.splits.at(name, step)
 
     @property
     def contact(self) -> "Contact | None":

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from protocol.factor import FactorPattern
-from sim_server.arrays import Float64
+from sim_server.arrays import Float64, Int32
 from sim_server.backends.state import StateArray
 
 if TYPE_CHECKING:
@@ -375,12 +375,17 @@ class CutInput:
     """What tells engines which nodes of bodies lost elements, and when.
 
     bodies: indices of those that may; at_rest, changed_at, free (nodes,): as in effects/cutting.py
+    spawn: launch that begins copies of nodes after parameters have changed, None if none are; origin, copied_at
+        (nodes,): where they come from and since when, as in effects/cutting_split.cu
     """
 
     bodies: Sequence[int]
     at_rest: Float64
     changed_at: Float64
     free: Float64
+    spawn: Launch | None = None
+    origin: Int32 | None = None
+    copied_at: Float64 | None = None
 
 
 class Backend(Protocol):

@@ -135,8 +135,10 @@ def capture(simulation: Simulation, driver: Driver, software: str) -> Checkpoint
         if not driver.policy.free and state.job.matrix is not None:
             step, values = state.job.matrix
             method = state.factors.method(step)
-            entry.job = JobEntry(step=step, method=method.name if method else "")
-            arrays[f"job/{name}/matrix"] = values.copy()
+            if simulation.epoch(name, step) == simulation.epoch(name, engine.step):  # another one has another pattern
+                entry.job = JobEntry(step=step, method=method.name if method else "")
+                blocks = simulation.system.body_values(state.body.first, state.body.last)
+                arrays[f"job/{name}/matrix"] = values[: len(blocks)].copy() if values.ndim == 3 else values.copy()
         bodies.append(entry)
     manifest = Manifest(
         format="", version=0, software=software, device=simulation.world.backend.name,
@@ -227,7 +229,8 @@ def saved_factors(simulation: Simulation, checkpoint: Checkpoint, manifest: Mani
                 shape = (body.last - body.first, 3)
             matrix = checkpoint.array(f"job/{body.name}/matrix", np.float64, shape)
             method = solver.method_named(entry.job.method)
-            found.jobs.append(Job(body.name, 1, entry.job.step, warped, matrix, solver.factor_dtype, method))
+            epoch = simulation.epoch(body.name, entry.job.step)
+            found.jobs.append(Job(body.name, epoch, entry.job.step, warped, matrix, solver.factor_dtype, method))
     return found
 
 

@@ -69,6 +69,10 @@ class Effect:
         """Returns whether it goes on rightly where elements of a body are removed (cutting.py)."""
         return False
 
+    def splittable(self, body: Body) -> bool:
+        """Returns whether it goes on rightly where a body is split along faces of its elements (cutting.py)."""
+        return False
+
     @property
     def comes_first(self) -> bool:
         """True if its launches run before those of other effects."""

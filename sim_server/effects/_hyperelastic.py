@@ -161,12 +161,12 @@ class Tetrahedra(Effect):
         self._constants_of: PerBody[Values] | None = None
         tets = np.concatenate([body.tets for body, _ in listed])
         self.order = np.argsort(tets.min(axis=1), kind="stable")  # elements near in the mesh are near in memory
-        self.elements: Int32 = np.ascontiguousarray(tets[self.order])
+        self.elements: Int32 = world.elements_of(self.bodies, self.order)
         m = len(self.elements)
         counts = [len(body.mesh.tets) for body, _ in listed]
         self.owner = np.repeat([body.index for body, _ in listed], counts)[self.order]
         self.number = np.concatenate([np.arange(n) for n in counts])[self.order]
-        self.rest = RestShape(world, self.bodies, self.elements, self.order)
+        self.rest = RestShape(world, self.bodies, np.ascontiguousarray(tets[self.order]), self.order)
         self.volume = self.rest.followed(world, lambda scene: self.rest.volume(scene) * self.rest.present(scene))
         self.gradients = self.rest.followed(world, self._gradients)
         self.corners, self.edges = np.zeros((4, m, 9)), np.zeros((6, m, 9))
@@ -235,6 +235,9 @@ class Hyperelastic(Tetrahedra):
     def cuttable(self, body: Body) -> bool:
         """Returns whether the law is defined for elements that are inside out, as removed ones may be."""
         return self.law.regularizes or not self.law.refuses
+
+    def splittable(self, body: Body) -> bool:
+        return True
 
     def _gradients_along(self, axes_of: Callable[[Values], Float64], scene: Scene) -> Float64:
         """Returns gradients (9, m) by the material axes."""

@@ -129,10 +129,10 @@ class Corotational(Effect):
         self.rotated = tuple(body for body, _ in listed)
         tets = np.concatenate([body.tets for body, _ in listed])
         order = np.argsort(tets.min(axis=1), kind="stable")  # elements near in the mesh are near in memory
-        self.elements: Int32 = np.ascontiguousarray(tets[order])
+        self.elements: Int32 = world.elements_of(self.rotated, order)
         self._constants = PerBody("corotational", self.rotated, _constants)
         self.elastic = world.at_start(self.elastic_in)
-        rest = RestShape(world, self.rotated, self.elements, order)
+        rest = RestShape(world, self.rotated, np.ascontiguousarray(tets[order]), order)
         self.gradients = rest.followed(world, lambda scene: rest.gradients(scene).reshape(-1, 9).T)
 
         def lame(scene: Scene) -> Float64:
@@ -154,6 +154,9 @@ class Corotational(Effect):
         self._energy = np.zeros(m)
 
     def cuttable(self, body: Body) -> bool:
+        return True
+
+    def splittable(self, body: Body) -> bool:
         return True
 
     def elastic_in(self, scene: Scene) -> Mapping[int, tuple[Float64, Float64]]:

@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: MIT
-"""Elements that are taken out of an object while it moves: by a blade, in a sphere, in a region, or by their numbers.
+"""Elements that are taken out of an object while it moves: by a blade, in a sphere, in a region, or by their numbers;
+and faces between elements that are opened, so that it comes apart there.
 
 What is removed has no stiffness, no mass and no surface from one step to the next: all constants of the element are 0,
 and its nodes lose its part of their masses. What an element's removal opens becomes surface. Pieces that come apart
@@ -14,6 +15,12 @@ Schwarz method; on a CPU, as long as that is cheap) ::
 
 The momentum of what stays is that before the cut. Cuts follow the elements: edges are as rough as the mesh is coarse.
 
+With `spare` nodes a body is split along faces of its elements, too, and loses nothing (mechanics/splitting.py): the
+elements around a node that no longer hang together through faces get a copy of it for each further group, where the
+node is and with its velocity. `opened` are these faces, cut after cut, a live parameter like `removed`; pattern and
+lists of A follow it (mechanics/split_pattern.py). With M the map by which copies move as the nodes that the factor
+knows, M P M^T takes the place of P above.
+
 `removed` is what the scene begins with, and a live parameter: clients cut by `sim-client cut`, which sets it; so cuts
 are logged, replayed, kept by checkpoints, and taken back by a reset.
 
@@ -26,16 +33,19 @@ Source: Cotin, Delingette and Ayache, A hybrid elastic model for real-time cutti
 """
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Annotated, Any
 
 import numpy as np
-from pydantic import AfterValidator, Field
+from pydantic import AfterValidator, Field, model_validator
 
-from sim_server.arrays import Float64
+from sim_server.arrays import Float64, Int32
 from sim_server.backends.base import CutInput, Launch
 from sim_server.effects._base import Effect
 from sim_server.errors import InputError
-from sim_server.mechanics.removal import masses_left, present, present_nodes, ranges_of
+from sim_server.mechanics.numbers import ranges_of
+from sim_server.mechanics.removal import masses_left, present, present_nodes, whole_masses
+from sim_server.mechanics.splitting import Splitting, cuts_of
 from sim_server.mechanics.system import Stencil, System
 from sim_server.mechanics.world import Body, World
 from sim_server.mesh.faces import Faces
@@ -44,11 +54,20 @@ from sim_server.scene.live import Live
 from sim_server.scene.parameters import Parameters, complaint
 
 SCOPE = "object"
+MOST_SPARES = 1_000_000
 
 
 def _numbers(text: str) -> str:
     try:
         ranges_of(text)
+    except ValueError as error:
+        raise complaint(str(error)) from None
+    return text
+
+
+def _cuts(text: str) -> str:
+    try:
+        cuts_of(text)
     except ValueError as error:
         raise complaint(str(error)) from None
     return text
@@ -61,6 +80,20 @@ class Params(Parameters):
     tear: Annotated[float | None, Live(1.05, 4)] = Field(
         default=None, gt=1, description="largest stretch of an element, above which it is removed [-]; none if left out"
     )
+
+    spare: int = Field(
+        default=0, ge=0, le=MOST_SPARES, description="nodes kept for splitting, which copies nodes; 0: none is split"
+    )
+    opened: Annotated[str, AfterValidator(_cuts), Live(listed=False)] = Field(
+        default="",
+        description='faces that hold nothing, cut after cut: 4 e + k for the k-th of element e, such as "3 7-9; 40"',
+    )
+
+    @model_validator(mode="after")
+    def _spares_to_open(self) -> "Params":
+        if self.opened.strip() and not self.spare:
+            raise complaint("opened needs spare nodes: spare = 0")
+        return self
 
 
 class Cutting(Effect):
@@ -87,7 +120,11 @@ class Cutting(Effect):
             )
         n, masses = world.nodes, world.mass.copy()
         world.uncut_mass = masses
-        world.follow_into(world.mass, "cutting", compute=lambda scene: masses_left(self._parts(scene), masses))
+
+        def left(scene: Scene) -> Float64:
+            return masses_left(self._parts(scene), whole_masses(scene, world, masses))
+
+        world.follow_into(world.mass, "cutting", compute=left)
         self.left = world.follow("cutting", compute=lambda scene: self._parts(scene).copy())
         self.faces = {body.index: Faces.of(body.mesh.tets) for body in self.bodies}
         self.surface = world.follow("cutting", compute=self._on_surface)
@@ -97,6 +134,25 @@ class Cutting(Effect):
         world.without_elements = self.at_rest
         world.backend.keep(self._before, self.at_rest)
         world.backend.keep(self.changed_at, exact=True)
+        self._spawn: Launch | None = None
+        if world.splitting is not None:
+            self._keep_spares()
+
+    def _keep_spares(self) -> None:
+        """Begins what splitting needs: nodes that wait, and where copies come from."""
+        w = self.world
+        assert w.splitting is not None
+        splitting, name = w.splitting, self.bodies[0].name
+        if w.backend.name == "gpu":
+            raise InputError(f"object {name!r}, effect cutting: spare: objects are split on a CPU alone: --device cpu")
+        if w.holders:
+            raise InputError(
+                f"object {name!r}, effect cutting: spare: objects of a scene with holders cannot be split; allowed: "
+                "fixed, or spare = 0"
+            )
+        self.origin: Int32 = w.follow("cutting", compute=lambda scene: splitting.nodes(scene, "origin"))
+        self._origin_before, self.copied_at = self.origin.copy(), np.full(w.nodes, -1.0)
+        self.at_rest[self.origin < 0] = 1
 
     def _parts(self, scene: Scene) -> Float64:
         """Returns `left` by the parameters of a scene, which two arrays ask for one after the other."""
@@ -108,10 +164,26 @@ class Cutting(Effect):
         """Returns 1 for nodes of surfaces, and for those of objects that are not cut."""
         out = np.ones(self.world.nodes)
         for body in self.bodies:
-            triangles = self.faces[body.index].surface(present(scene, [body]))
+            triangles = self.surface_of(scene, body)
             out[body.nodes] = 0
             out[triangles.ravel() + body.first] = 1
         return out
+
+    def surface_of(self, scene: Scene, body: Body) -> Int32:
+        """Returns the surface of a body by the parameters of a scene, (t, 3) in its own nodes, outward."""
+        faces, splitting = self.faces[body.index], self.world.splitting
+        if splitting is None or body.index not in splitting.splitters:
+            return faces.surface(present(scene, [body]))
+        split = splitting.of(scene, body.index)
+        return faces.surface(present(scene, [body]), split.tets, split.closed)
+
+    def with_copies(self, scene: Scene, x: Float64) -> Float64:
+        """Returns positions (n, 3) in which copies that no step has made yet are where they come from."""
+        assert self.world.splitting is not None
+        origin = self.world.splitting.nodes(scene, "origin")
+        for node in np.flatnonzero((origin >= 0) & (self._origin_before < 0)):  # copies follow what they come from
+            x[node] = x[origin[node]]
+        return x
 
     def check(self, effects: Mapping[str, Effect]) -> None:
         """Raises InputError where another effect would go on as if nothing had been removed."""
@@ -120,6 +192,8 @@ class Cutting(Effect):
             listed = [e for e in effects.values() if e.name in body.effects and e.name != "fixed"]
             if wrong := [e.name for e in listed if not e.cuttable(body)]:
                 raise self._refusal(body, f"elements cannot be removed with the effect {wrong[0]}")
+            if body.effects["cutting"].spare:
+                self._check_splittable(body, [e for e in listed if e is not self], effects)
             tied = {a.object for a in w.attachments} | {a.to for a in w.attachments}
             if body.name in tied | {end.object for s in w.springs for end in s.between}:
                 raise self._refusal(body, "an object with attachments or springs cannot be cut")
@@ -129,9 +203,36 @@ class Cutting(Effect):
                 "objects that are cut touch obstacles alone: contact = { between = false }, self = false",
             )
 
+    def _check_splittable(self, body: Body, listed: list[Effect], effects: Mapping[str, Effect]) -> None:
+        """Raises InputError where a body with spare nodes could be split, but something would not follow."""
+        w = self.world
+        if wrong := [e.name for e in listed if not e.splittable(body)]:
+            raise self._refusal(
+                body, f"spare: an object with the effect {wrong[0]} cannot be split; allowed: spare = 0"
+            )
+        if body.skin is not None:
+            raise self._refusal(body, "spare: an object with a skin is not split, which would stay whole")
+        named = w.at_start(lambda scene: scene.effects)
+        if wrong := [name for name in named if not effects[name].splittable(body)]:
+            raise self._refusal(body, f"spare: objects of a scene with the effect {wrong[0]} cannot be split")
+        scheme = w.at_start(lambda scene: scene.integrator.scheme)
+        if scheme != "backward_euler":
+            raise self._refusal(body, f"spare: objects are not split in the scheme {scheme}; allowed: backward_euler")
+
     def join(self, others: Sequence[Effect]) -> None:
         """Says what may be touched before the first step, once all that is fixed is known."""
+        if self.world.splitting is not None:
+            self._free_spares(self.world.splitting)
         self.touchable[:] = self.world.free * self.surface
+
+    def _free_spares(self, splitting: Splitting) -> None:
+        """Frees spare nodes of what regions have made of them; raises InputError for bodies with rollers."""
+        w = self.world
+        for index in splitting.splitters:
+            body = w.bodies[index]
+            if w.rollers is not None and w.rollers.limited[body.nodes].any():
+                raise self._refusal(body, "spare: fixed with along does not go together with splitting")
+        w.free[self.origin < 0] = 1
 
     def _refusal(self, body: Body, why: str) -> InputError:
         return InputError(f"object {body.name!r}, effect cutting: {why}")
@@ -145,7 +246,10 @@ class Cutting(Effect):
 
     def cut_input(self) -> CutInput:
         """Returns what keeps factors useful that were made before a cut."""
-        return CutInput([body.index for body in self.bodies], self.at_rest, self.changed_at, self.world.free)
+        given = CutInput([body.index for body in self.bodies], self.at_rest, self.changed_at, self.world.free)
+        if self._spawn is None:
+            return given
+        return replace(given, spawn=self._spawn, origin=self.origin, copied_at=self.copied_at)
 
     def launches(self, system: System, stencil: Stencil | None, accumulate: bool) -> list[Launch]:
         w = self.world
@@ -154,7 +258,19 @@ class Cutting(Effect):
             changed_at=self.changed_at, at_rest=self.at_rest, surface=self.surface, free=w.free,
             touchable=self.touchable, v=w.v, predictor=w.predictor,
         )  # fmt: skip
-        return [settle]
+        if w.splitting is None:
+            return [settle]
+        text = w.backend.module("effects/cutting_split.cu")
+        self._spawn = text.bind(
+            "spawn", w.nodes, origin=self.origin, origin_before=self._origin_before, x=w.x, v=w.v,
+            predictor=w.predictor, damping_velocity=w.damping_velocity, dv=system.dv, free=w.free,
+            at_rest=self.at_rest,
+        )  # fmt: skip
+        note = text.bind(
+            "note", w.nodes, origin=self.origin, clock=system.clock, origin_before=self._origin_before,
+            copied_at=self.copied_at,
+        )  # fmt: skip
+        return [settle, note]
 
 
 def build(world: World, listed: list[tuple[Body, Any]]) -> Cutting:

@@ -44,6 +44,9 @@ class Gravity(Effect):
     def cuttable(self, body: Body) -> bool:
         return True
 
+    def splittable(self, body: Body) -> bool:
+        return True
+
     def launches(self, system: System, stencil: Stencil | None, accumulate: bool) -> list[Launch]:
         w = self.world
         return [

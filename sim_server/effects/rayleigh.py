@@ -70,6 +70,9 @@ class Drag(Effect):
     def cuttable(self, body: Body) -> bool:
         return True
 
+    def splittable(self, body: Body) -> bool:
+        return True
+
     def launches(self, system: System, stencil: Stencil | None, accumulate: bool) -> list[Launch]:
         w = self.world
         if not self.alpha.any() or w.explicit:  # an explicit scheme damps by world.alpha

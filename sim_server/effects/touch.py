@@ -119,6 +119,9 @@ class Touch(Effect):
     def cuttable(self, body: Body) -> bool:
         return True
 
+    def splittable(self, body: Body) -> bool:
+        return True
+
     def launches(self, system: System, stencil: Stencil | None, accumulate: bool) -> list[Launch]:
         self._system = system
         return [self._bind([])]

@@ -66,10 +66,11 @@ class PatchedTetrahedra:
     patches: Clusters
 
 
-def couplings(clusters: Clusters, world: World) -> Couplings:
+def couplings(clusters: Clusters, world: World, free: Float64) -> Couplings:
     """Keys row * n + column, corners (k, 2) and owners (k,) of all couplings above the diagonal between free nodes.
 
     Those of a held row and a free column have the key (row + n) * n + column. corners: into clusters.nodes
+    free (nodes,): not 0 at nodes that may move
     """
     n, parts = world.nodes, []
     for first, size in _by_size(clusters.start):
@@ -77,8 +78,8 @@ def couplings(clusters: Clusters, world: World) -> Couplings:
         shape = (len(first), size, size)
         a, b = (np.broadcast_to(c, shape).ravel() for c in (corner[:, :, None], corner[:, None, :]))
         i, j = (clusters.nodes[c].astype(np.int64) for c in (a, b))
-        here = (i < j) & (world.free[i] > 0) & (world.free[j] > 0)
-        held = (world.held[i] > 0) & (world.free[j] > 0)
+        here = (i < j) & (free[i] > 0) & (free[j] > 0)
+        held = (world.held[i] > 0) & (free[j] > 0)
         parts += [(i * n + j, a, b, here), ((i + n) * n + j, a, b, held)]
     keys = [key[mask] for key, _, _, mask in parts]
     corners = [np.stack([a[mask], b[mask]], axis=1).astype(np.int32) for _, a, b, mask in parts]

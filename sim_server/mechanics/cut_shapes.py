@@ -27,6 +27,37 @@ def met_by_blade(x: Float64, tets: Int32, corners: Float64) -> Int64:
     return near[met]
 
 
+def opened_by_blade(x: Float64, tets: Int32, owners: Int64, corners: Float64) -> Int64:
+    """Returns the numbers of the faces between elements that a surface meets and those on its other side.
+
+    An element is on the side of its centroid, by the triangle of the surface that it is beside; of the two elements of
+    such a face one at least meets the surface. owners (f, 2): elements of each face, -1: there is none
+    """
+    met = np.zeros(len(tets) + 1, bool)
+    met[met_by_blade(x, tets, corners)] = True
+    side, a, b = _sides(x[tets].mean(axis=1), corners), owners[:, 0], owners[:, 1]
+    return np.flatnonzero((a >= 0) & (b >= 0) & (side[a] != side[b]) & (met[a] | met[b]))
+
+
+def border(chosen: Bools, owners: Int64) -> Int64:
+    """Returns the numbers of the faces between chosen elements (m,) and others."""
+    inside = np.append(chosen, False)[owners]
+    return np.flatnonzero((owners >= 0).all(axis=1) & (inside[:, 0] != inside[:, 1]))
+
+
+def _sides(points: Float64, corners: Float64) -> Bools:
+    """Returns on which side of a surface points (m, 3) are; of a quadrangle by its triangle on their side of the
+    diagonal."""
+    triangles = [corners[[0, 1, 2]], *([corners[[0, 2, 3]]] if len(corners) == 4 else [])]
+    normals = [np.cross(t[1] - t[0], t[2] - t[0]) for t in triangles]
+    heights = np.stack([(points - corners[0]) @ normal for normal in normals])
+    if len(triangles) == 1:
+        return np.asarray(heights[0] > 0)
+    across = np.cross(normals[0] + normals[1], corners[2] - corners[0])
+    second = (points - corners[0]) @ across > 0
+    return np.asarray(np.where(second, heights[1], heights[0]) > 0)
+
+
 def in_sphere(x: Float64, tets: Int32, center: Float64, radius: float) -> Int64:
     """Returns the numbers of the elements whose centroids are within `radius` of `center` [m]."""
     return np.flatnonzero(np.linalg.norm(x[tets].mean(axis=1) - center, axis=1) <= radius)

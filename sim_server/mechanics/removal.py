@@ -2,60 +2,19 @@
 """Elements that a scene and its parameters have removed from an object, and what is left without them."""
 
 import json
-import re
 from collections.abc import Sequence
-from functools import lru_cache
 
 import numpy as np
 
 from sim_server.arrays import Float64, Int64
 from sim_server.errors import InputError
+from sim_server.mechanics.numbers import numbers_of, text_of
+from sim_server.mechanics.splitting import Splitting
 from sim_server.mechanics.world import Body, World
 from sim_server.scene import Scene
 
-NUMBERS = re.compile(r"\s*(\d{1,9})(?:-(\d{1,9}))?(?:\s+|$)")
 KEY = "object.{}.effects.cutting.removed"  # of the parameter, by the object's name
 LEAST_MASS = 1e-6  # of its own, which a node without elements keeps, since equations divide by it
-
-
-def ranges_of(text: str) -> list[tuple[int, int]]:
-    """Returns first and last number of each part of a text such as "3 7-9 12". Raises ValueError."""
-    at, ranges = 0, []
-    while at < len(text):
-        found = NUMBERS.match(text, at)
-        if found is None:
-            raise ValueError(f'{text[at : at + 20]!r} is no list of element numbers and ranges such as "3 7-9 12"')
-        first, last = int(found[1]), int(found[2] or found[1])
-        if last < first:
-            raise ValueError(f"{found[0].strip()!r} is no range of element numbers, from a lower to a higher one")
-        ranges.append((first, last))
-        at = found.end()
-    return ranges
-
-
-@lru_cache(maxsize=8)
-def numbers_of(text: str, count: int) -> Int64:
-    """Returns the numbers of such a text, ascending, once each, not to be changed. Raises ValueError.
-
-    count: of the elements that there are, from 0
-    """
-    ranges, named = ranges_of(text), np.zeros(count, bool)
-    if ranges and (last := max(last for _, last in ranges)) >= count:
-        raise ValueError(f"there is no element {last}: numbers are from 0 to {count - 1}")
-    for first, last in ranges:
-        named[first : last + 1] = True
-    return np.flatnonzero(named)
-
-
-def text_of(numbers: Sequence[int] | Int64) -> str:
-    """Returns numbers as a text of ranges, from which `numbers_of` reads them."""
-    found = np.unique(np.asarray(numbers, np.int64))
-    if not len(found):
-        return ""
-    first = np.flatnonzero(np.diff(found, prepend=found[0] - 2) > 1)
-    last = np.append(first[1:], len(found)) - 1
-    ends = zip(found[first].tolist(), found[last].tolist(), strict=True)
-    return " ".join(str(a) if a == b else f"{a}-{b}" for a, b in ends)
 
 
 def removed_from(scene: Scene, body: Body) -> Int64:
@@ -87,7 +46,9 @@ def present_nodes(scene: Scene, world: World) -> Float64:
     out = np.ones(world.nodes)
     for body in world.bodies:
         removed = removed_from(scene, body)
-        if len(removed):
+        if world.splitting is not None and body.index in world.splitting.splitters:
+            out[body.nodes] = _shares(world.splitting, scene, body)
+        elif len(removed):
             size = body.mesh.volumes
             gone = np.zeros(len(size))
             gone[removed] = size[removed]
@@ -97,6 +58,28 @@ def present_nodes(scene: Scene, world: World) -> Float64:
             lost = np.bincount(corners, weights=np.repeat(gone, 4), minlength=n)
             out[body.nodes] = np.where(left > 0, 1 - lost / np.where(whole > 0, whole, 1), 0)
     return out
+
+
+def _shares(splitting: Splitting, scene: Scene, body: Body) -> Float64:
+    """Returns the part of the elements of its root that each node of a body that may be split has, by volume, (n,)."""
+    split, splitter = splitting.of(scene, body.index), splitting.splitters[body.index]
+    n, size, present = len(split.origin), body.mesh.volumes, np.ones(len(body.mesh.tets))
+    present[removed_from(scene, body)] = 0
+    whole = np.bincount(splitter.whole.tets.ravel(), weights=np.repeat(size, 4), minlength=n)
+    here = np.bincount(split.tets.ravel(), weights=np.repeat(size * present, 4), minlength=n)
+    root = whole[split.root]
+    return here / np.where(root > 0, root, 1)
+
+
+def whole_masses(scene: Scene, world: World, masses: Float64) -> Float64:
+    """Returns the masses of the nodes from which nodes were copied, (nodes,) [kg]. masses: of the whole meshes"""
+    if world.splitting is None:
+        return masses
+    found = masses[world.splitting.nodes(scene, "root")]
+    for index in world.splitting.splitters:  # spare nodes that are left have some, since equations divide by it
+        own = found[world.bodies[index].nodes]
+        own[own == 0] = own.mean()
+    return found
 
 
 def masses_left(part: Float64, masses: Float64) -> Float64:

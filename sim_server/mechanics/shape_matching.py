@@ -11,13 +11,19 @@ share an element with i, those of level 2 one with a neighbour of level 1.
 """
 
 from collections.abc import Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sim_server.arrays import Float64, Int32
 from sim_server.backends.base import Launch
+from sim_server.errors import InputError
+from sim_server.mechanics.removal import masses_left, present_nodes, whole_masses
+from sim_server.mechanics.splitting import Splitting
 from sim_server.mechanics.world import Body, World
+from sim_server.scene import Scene
 
 
 class ShapeMatching:
@@ -25,13 +31,51 @@ class ShapeMatching:
 
     start (nodes + 1,), neighbour (k,): neighbours of each node, none at nodes of other bodies
     arm (k, 3): m_j (X_j - X_c), scaled so that the trace of A_i at rest is 1
+    Where bodies may be split, all three follow the scene.
     """
 
     def __init__(self, world: World, bodies: Sequence[Body], level: int):
-        self.world = world
-        tets = np.concatenate([body.tets for body in bodies])
-        self.start, self.neighbour = neighbours(tets, world.nodes, level)
-        self.arm = _arms(world.rest, world.uncut_mass, self.start, self.neighbour)
+        self.world, self._bodies, self._level = world, bodies, level
+        splitting = world.splitting
+        if splitting is None or not any(body.index in splitting.splitters for body in bodies):
+            self.start, self.neighbour, self.arm = world.at_start(self._of)
+            return
+        most = self._room(splitting)
+        self._last: tuple[Scene, tuple[Int32, Int32, Float64]] | None = None
+        self.start, self.neighbour, self.arm = (
+            world.follow("cutting", compute=partial(self._followed, part, most)) for part in range(3)
+        )
+
+    def _of(self, scene: Scene) -> tuple[Int32, Int32, Float64]:
+        """Returns start, neighbour and arm by the parameters of a scene."""
+        w, splitting, mass, rest = self.world, self.world.splitting, self.world.uncut_mass, self.world.rest
+        tets = [body.tets if splitting is None else splitting.tets(scene, body) for body in self._bodies]
+        if splitting is not None:
+            root = splitting.nodes(scene, "root")
+            mass, rest = masses_left(present_nodes(scene, w), whole_masses(scene, w, mass)), rest[root]
+        start, neighbour = neighbours(np.concatenate(tets), w.nodes, self._level)
+        return start, neighbour, _arms(rest, mass, start, neighbour)
+
+    def _followed(self, part: int, most: int, scene: Scene) -> NDArray[Any]:
+        """Returns one of these three arrays with room for `most` neighbours."""
+        if self._last is None or self._last[0] is not scene:
+            self._last = scene, self._of(scene)
+        found = self._last[1][part]
+        if part == 0:
+            return found.copy()
+        if len(found) > most:
+            raise InputError(f"the frames of nodes need room for {len(found)} neighbours, {most} is what there is")
+        return np.concatenate([found, np.zeros((most - len(found), *found.shape[1:]), found.dtype)])
+
+    def _room(self, splitting: Splitting) -> int:
+        """Returns how many neighbours there is room for: those in the whole meshes, and for each spare node twice as
+        many as nodes there at most have, its own and itself as that of others."""
+        room = 0
+        for body in self._bodies:
+            splitter = splitting.splitters.get(body.index)
+            start, _ = neighbours(body.mesh.tets, len(body.mesh.rest), self._level)
+            room += int(start[-1]) + (2 * splitter.spares * int(np.diff(start).max()) if splitter else 0)
+        return room
 
     def launch(self, mean: Float64) -> Launch:
         """Launch that writes A_i in place of the sum of rotations `mean` (n, 10) at the bodies' nodes."""

@@ -9,7 +9,7 @@ all in the world frame; kernels/nodes.cu (`rotate`) and kernels/rotate_blocks.cu
 frame, where the solve happens.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -19,6 +19,7 @@ from sim_server.arrays import Float64, Int32, Int64
 from sim_server.backends.base import Launch
 from sim_server.mechanics import clusters
 from sim_server.mechanics.clusters import Couplings, PatchedCells, PatchedTetrahedra
+from sim_server.mechanics.split_pattern import FollowedPattern, Numbering
 from sim_server.mechanics.world import World
 
 
@@ -68,17 +69,25 @@ class System:
     def __init__(self, world: World, elements: Sequence[Coupled]):
         n = world.nodes
         self.world = world
-        places = [_places_of(e, world) for e in elements]
+        places = [places_of(e, world, world.free) for e in elements]
         keys = np.unique(np.concatenate([np.zeros(0, np.int64), *(each for place in places for each in place.keys)]))
         rows, columns = (part.astype(np.int32) for part in np.divmod(keys, n))
         above = rows < n
         self.row, self.column = rows[above], columns[above]
         self.held_rows, self.held_columns = rows - np.int32(n), columns
-        self._number(n)
         self.stencils = [place.stencil(n, keys) for place in places]
+        self.followed: FollowedPattern | None = None
+        if world.splitting is None:
+            self._take(vars(Numbering.of(self.row, self.column, n)))
+            blocks, most = len(keys), len(self.columns)
+        else:  # which has no holders beside it
+            self.followed = FollowedPattern(world, elements, self.row)
+            arrays, self.stencils = self.followed.follow()
+            self._take(arrays)
+            blocks, most = self.followed.blocks, self.followed.places + 1
 
-        self.sums = np.zeros((len(keys), 3, 3))
-        self.values = np.zeros((len(self.columns), 3, 3))
+        self.sums = np.zeros((blocks, 3, 3))
+        self.values = np.zeros((most, 3, 3))
         self.diagonal = np.zeros(n)
         self.block = np.zeros((n, 6))
         self.b = np.zeros((n, 3))
@@ -112,21 +121,11 @@ class System:
         first, last = (np.searchsorted(self.held_rows, node, side) for side in ("left", "right"))
         return first.astype(np.int32), last.astype(np.int32)
 
-    def _number(self, n: int) -> None:
-        """Numbers the places in block CSR of the blocks above, below and on the diagonal."""
-        below = np.argsort(self.column, kind="stable")  # row after row of the lower triangle, columns ascending
-        lower = np.bincount(self.column, minlength=n)
-        upper = np.bincount(self.row, minlength=n)
-        start = np.concatenate([[0], np.cumsum(lower + 1 + upper)])
-        own = start[:-1] + lower
-        self.row_start: Int32 = start.astype(np.int32)
-        self.own: Int32 = own.astype(np.int32)
-        self.upper: Int32 = _runs(self.row, own + 1, upper)
-        self.lower: Int32 = np.empty_like(self.upper)
-        self.lower[below] = _runs(self.column[below], start[:-1], lower)
-        self.columns: Int32 = np.empty(start[-1], dtype=np.int32)
-        self.columns[self.own] = np.arange(n, dtype=np.int32)
-        self.columns[self.upper], self.columns[self.lower] = self.column, self.row
+    def _take(self, numbering: Mapping[str, Int32]) -> None:
+        """Keeps the places in block CSR of the blocks above, below and on the diagonal."""
+        self.row, self.column = numbering["row"], numbering["column"]
+        self.row_start, self.own = numbering["row_start"], numbering["own"]
+        self.upper, self.lower, self.columns = numbering["upper"], numbering["lower"], numbering["columns"]
 
     def start(self, mass: Float64) -> Launch:
         """Sets b = 0 and the diagonal to mass (n,) [kg]."""
@@ -183,24 +182,24 @@ class System:
         start = self.row_start[first : last + 1]
         return (start - start[0]).astype(np.int32), (self.columns[start[0] : start[-1]] - first).astype(np.int32)
 
+    def most_blocks(self, first: int, last: int) -> int:
+        """Returns the blocks that a body has at most, however it is split."""
+        if self.followed is None:
+            return int(self.row_start[last] - self.row_start[first])
+        return last - first + 2 * self.followed.blocks
+
     def body_values(self, first: int, last: int) -> Float64:
         """Returns a view of the blocks of one body, (blocks, 3, 3)."""
         return self.values[self.row_start[first] : self.row_start[last]]
 
 
-def _runs(group: Int32, begin: Int64, count: Int64) -> Int32:
-    """Assigns consecutive places to the members of each group, from begin[group] on; groups ascend."""
-    first = np.cumsum(count) - count
-    return (np.arange(len(group)) - first[group] + begin[group]).astype(np.int32)
-
-
-def _couplings(elements: Int32, world: World, n: int) -> tuple[Int64, Int32]:
+def _couplings(elements: Int32, world: World, n: int, free: Float64) -> tuple[Int64, Int32]:
     """Keys row * n + column and pairs c c e + c a + b of all couplings above the diagonal between free corners.
 
     Those of a held row and a free column have the key (row + n) * n + column, so they come last.
     """
     keys, pairs = [], []
-    free, held = world.free, world.held
+    held = world.held
     corners = elements.shape[1]
     element = corners**2 * np.arange(len(elements), dtype=np.int32)
     for a in range(corners):
@@ -217,7 +216,7 @@ def _couplings(elements: Int32, world: World, n: int) -> tuple[Int64, Int32]:
 
 
 @dataclass(frozen=True)
-class _Places:
+class Places:
     """What an effect couples.
 
     keys: of its blocks, row * nodes + column; stencil: makes its places from the number of nodes and the keys of all
@@ -227,15 +226,17 @@ class _Places:
     stencil: Callable[[int, Int64], Stencil]
 
 
-def _places_of(coupled: Coupled, world: World) -> _Places:
+def places_of(coupled: Coupled, world: World, free: Float64) -> Places:
+    """Returns what elements couple. free (nodes,): not 0 at nodes that may move"""
     if isinstance(coupled, PatchedCells):
-        found = [clusters.couplings(each, world) for each in (coupled.cells, coupled.patches, coupled.dilating)]
-        return _Places([keys for keys, *_ in found], partial(_patched_stencil, coupled, found))
+        found = [clusters.couplings(c, world, free) for c in (coupled.cells, coupled.patches, coupled.dilating)]
+        return Places([keys for keys, *_ in found], partial(_patched_stencil, coupled, found))
     if isinstance(coupled, PatchedTetrahedra):
-        pairs, of_patches = _couplings(coupled.elements, world, world.nodes), clusters.couplings(coupled.patches, world)
-        return _Places([pairs[0], of_patches[0]], partial(_stencil_of_tetrahedra, coupled, pairs, of_patches))
-    pairs = _couplings(coupled, world, world.nodes)
-    return _Places([pairs[0]], partial(_stencil, coupled, pairs))
+        pairs = _couplings(coupled.elements, world, world.nodes, free)
+        of_patches = clusters.couplings(coupled.patches, world, free)
+        return Places([pairs[0], of_patches[0]], partial(_stencil_of_tetrahedra, coupled, pairs, of_patches))
+    pairs = _couplings(coupled, world, world.nodes, free)
+    return Places([pairs[0]], partial(_stencil, coupled, pairs))
 
 
 def _patched_stencil(elements: PatchedCells, found: list[Couplings], n: int, blocks: Int64) -> Stencil:

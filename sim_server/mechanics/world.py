@@ -13,6 +13,7 @@ from sim_server.arrays import Float64, Int32
 from sim_server.backends.base import Backend
 from sim_server.errors import InputError
 from sim_server.mechanics.rollers import Rollers
+from sim_server.mechanics.splitting import Splitter, Splitting, split_of, with_spares
 from sim_server.mesh import Mesh, posed
 from sim_server.mesh.shape_functions import MASS_PARTS, quadratic_gradients
 from sim_server.mesh.surface import volumes
@@ -53,7 +54,7 @@ class Body:
     @property
     def tets(self) -> Int32:
         """Corners (m, 4) in node numbers of the scene."""
-        return self.mesh.tets + np.int32(self.first)
+        return self.mesh.tets + np.int32(self.first)  # as the mesh has them, before it was split
 
     @property
     def centroids(self) -> Float64:
@@ -90,6 +91,7 @@ class World:
     free (n,): 1, or 0 at fixed nodes; held (n,): 1 at nodes of holders, which are fixed, too; held_nodes (held,): these
     nodes in the order of the launches over them; held_moves (bodies,): 1 where a holder moves in a step by stages;
     without_elements (n,): 1 at free nodes whose elements were all removed; None: none can be
+    splitting: the bodies that may be split along faces, None if none may
     touchable (n,): 1 at nodes that may touch obstacles, where that changes as objects are cut; None: as `free`
     rollers: nodes that may move along some directions only, None without any; alpha, beta (bodies,):
     Rayleigh damping of the mass [1/s] and of the stiffness [s] at the start; damping: both by the
@@ -130,12 +132,20 @@ class World:
         self.bodies: list[Body] = []
         meshes = [(o, o.load_mesh()) for o in scene.objects]
         first = 0
-        for o, mesh in meshes:
-            last = first + len(mesh.rest)
+        splitters: dict[int, Splitter] = {}
+        for index, (o, mesh) in enumerate(meshes):
             kind = kind_of_elements(o, mesh, scene.integrator)
+            if spares := getattr(o.effects.get("cutting"), "spare", 0):
+                splitters[index] = Splitter(o.name, mesh, spares)
+                mesh = with_spares(mesh, splitters[index], split_of(scene, index, splitters[index]))
+                meshes[index] = o, mesh
+            last = first + len(mesh.rest)
             given = dict(o.effects), o.friction or 0.0, o.load_skin(mesh), kind
             self.bodies.append(Body(len(self.bodies), o.name, mesh, first, last, *given))
             first = last
+        self.splitting: Splitting | None = None
+        if splitters:
+            self.splitting = Splitting(splitters, [body.first for body in self.bodies], first)
         self.obstacles: Sequence[Obstacle] = scene.obstacles or []
         self.holders: Sequence[Holder] = scene.holders or []
         self.attachments: Sequence[Attachment] = scene.attachments or []
@@ -147,7 +157,7 @@ class World:
         self.rest = np.concatenate([mesh.rest for _, mesh in meshes])
         self.x = np.concatenate([posed(mesh.rest, o.pose.rotate, o.pose.translate) for o, mesh in meshes])
         self.v = np.zeros_like(self.x)
-        self.mass = np.concatenate([_lumped(o, mesh) for o, mesh in meshes])
+        self.mass = np.concatenate([_lumped(o, mesh, splitters.get(k)) for k, (o, mesh) in enumerate(meshes)])
         self.uncut_mass = self.mass
         self.free, self.held = np.ones(first), np.zeros(first, np.int32)
         self.held_nodes, self.held_moves = np.zeros(0, np.int32), np.zeros(len(self.bodies), np.int32)
@@ -187,6 +197,22 @@ class World:
         """Has an array that there is follow parameters, as `follow` does for a new one."""
         array[...] = compute(self._scene)
         self.live_arrays.append(LiveArray(array, of, compute))
+
+    def elements_of(self, bodies: Sequence[Body], order: NDArray[np.integer]) -> Int32:
+        """Returns the elements (m, 4) of bodies, one after another, in an order (m,), by nodes of the scene.
+
+        Those of bodies that may be split follow the scene.
+        """
+        splitting = self.splitting
+        if splitting is None or not any(body.index in splitting.splitters for body in bodies):
+            return np.ascontiguousarray(np.concatenate([body.tets for body in bodies])[order])
+
+        def compute(scene: Scene) -> Int32:
+            return np.ascontiguousarray(np.concatenate([splitting.tets(scene, body) for body in bodies])[order])
+
+        elements: Int32 = self.follow("cutting", compute=compute)
+        splitting.note(elements, compute)
+        return elements
 
     def share_load(self, effect: AddsLoad) -> Float64:
         """Returns `load` for an effect to add to."""
@@ -268,8 +294,9 @@ class World:
         return [(b, b.effects[name]) for b in self.bodies if name in b.effects]
 
 
-def _lumped(o: SceneObject, mesh: Mesh) -> Float64:
-    """Nodal masses [kg], (n,): parts of each adjacent element's, a quarter of a linear one's, or all equal."""
+def _lumped(o: SceneObject, mesh: Mesh, splitter: Splitter | None = None) -> Float64:
+    """Nodal masses [kg], (n,): parts of each adjacent element's, a quarter of a linear one's, or all equal; those of
+    the mesh as it is whole, 0 at spare nodes."""
     if mesh.quadratic is None:
         volume = volumes(mesh.rest, mesh.tets)
     else:
@@ -278,7 +305,8 @@ def _lumped(o: SceneObject, mesh: Mesh) -> Float64:
     if not np.isfinite(total):
         raise InputError(f"object {o.name!r}: its mass is not finite")
     if o.masses == "equal":
-        return np.full(len(mesh.rest), total / len(mesh.rest))
+        own = splitter.nodes if splitter else len(mesh.rest)
+        return np.where(np.arange(len(mesh.rest)) < own, total / own, 0.0)
     if mesh.quadratic is not None:
         nodes, share = mesh.quadratic, (total * volume[:, None] / volume.sum() * MASS_PARTS).ravel()
     else:

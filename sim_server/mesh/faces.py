@@ -13,10 +13,11 @@ from sim_server.mesh.surface import FACES, grouped_faces
 @dataclass(frozen=True)
 class Faces:
     """corners (f, 2, 3): nodes of each face as each of its two elements has them, outward; owners (f, 2): these, -1:
-    there is none."""
+    there is none; sides (f, 2): 4 times the element + row of FACES, -1: there is none."""
 
     corners: Int32
     owners: Int64
+    sides: Int64
 
     @classmethod
     def of(cls, tets: Int32) -> "Faces":
@@ -28,10 +29,19 @@ class Faces:
         both = np.full((number[-1] + 1, 2), -1)
         both[:, 0] = order[first]
         both[number[second], 1] = order[second]
-        return cls(corners[both].astype(np.int32), np.where(both < 0, -1, both // 4))
+        return cls(corners[both].astype(np.int32), np.where(both < 0, -1, both // 4), both)
 
-    def surface(self, present: Float64 | NDArray[np.bool_]) -> Int32:
-        """Returns the triangles (t, 3) that one present element has alone, outward. present: (m,), not 0 where so."""
+    def surface(
+        self, present: Float64 | NDArray[np.bool_], tets: Int32 | None = None, closed: NDArray[np.bool_] | None = None
+    ) -> Int32:
+        """Returns the triangles (t, 3) that one present element has alone, outward. present: (m,), not 0 where so.
+
+        tets, closed: of a mesh that was split, its elements, and the faces (f,) that hold two of them together
+        """
         there = (np.append(present, 0) != 0)[self.owners]
         alone, side = there.sum(axis=1) == 1, there.argmax(axis=1)
-        return self.corners[alone, side[alone]]
+        if tets is None or closed is None:
+            return self.corners[alone, side[alone]]
+        opened = there.all(axis=1) & ~closed
+        sides = np.concatenate([self.sides[alone, side[alone]], self.sides[opened].ravel()])
+        return tets[sides[:, None] // 4, FACES[sides % 4]].astype(np.int32)

@@ -79,10 +79,18 @@ class Dispatch(FactorSource):
     def announce(self, topology: Topology) -> None:
         """Begins a new epoch of an object; answers to jobs of the last one are refused."""
         with self._lock:
+            if (job := self._leases.by_object.get(topology.header.object)) is not None:
+                self._fail(job, "was of a mesh that was split since")
             self._decoder.announce(topology)
             self._leases.forget_object(topology.header.object)
             self._timing.forget_object(topology.header.object)
             self._reliability.forget_object(topology.header.object)
+
+    def epoch(self, name: str) -> int | None:
+        """Returns the epoch of an object that was announced last; jobs of others are refused."""
+        with self._lock:
+            known = self._decoder.objects.get(name)
+            return None if known is None else known.epoch
 
     def workers(self) -> list[WorkerInfo]:
         """Returns the last heartbeats of the workers that may be given jobs."""

@@ -22,6 +22,7 @@ from sim_server.mesh import posed
 from sim_server.mesh.surface import surface_triangles
 from sim_server.parameters import LiveParameter, ParameterUpdate
 from sim_server.recording.object_steps import Reactions, Readings, object_step, rows
+from sim_server.scene import Scene
 from sim_server.scene.solver_options import FACTORS
 from sim_server.simulation import Simulation
 from sim_server.state import code
@@ -68,22 +69,12 @@ def published(message: pb.Scene) -> pb.Scene:
 
 
 def topology(simulation: Simulation, body: Body) -> pb.Topology:
-    """Converts mesh and block pattern of one object, epoch 1."""
-    pose = simulation.scene.objects[body.index].pose
-    row_start, columns = simulation.system.body_pattern(body.first, body.last)
-    fixed = np.flatnonzero(simulation.fixed[body.nodes])
+    """Converts mesh and block pattern of one object as they are now; epoch 1, unless it was split."""
     message = pb.Topology(
-        header=pb.Header(object=body.name, epoch=1),
+        header=pb.Header(object=body.name, epoch=simulation.epoch(body.name, simulation.engine.step)),
         nodes=body.last - body.first,
-        rest=_bytes(posed(body.mesh.rest, pose.rotate, pose.translate), "<f8"),
-        tets=_bytes(body.mesh.tets, "<i4"),
-        triangles=_bytes(surface_triangles(body.mesh.tets), "<i4"),
-        row_start=_bytes(row_start, "<i4"),
-        columns=_bytes(columns, "<i4"),
-        fixed=_bytes(fixed, "<i4"),
     )
-    if any(pose.rotate) or any(pose.translate):
-        message.reference = _bytes(body.mesh.rest, "<f8")
+    shape(simulation, body, simulation.parameters.scene, message)
     if body.mesh.quadratic is not None:
         message.quadratic = _bytes(body.mesh.quadratic, "<i4")
     for name, group in body.mesh.groups.items():
@@ -94,6 +85,26 @@ def topology(simulation: Simulation, body: Body) -> pb.Topology:
         message.skin_triangles = _bytes(body.skin.triangles, "<i4")
     moduli(simulation, body, message)
     return message
+
+
+def shape(simulation: Simulation, body: Body, scene: Scene, message: pb.Topology) -> None:
+    """Sets mesh and block pattern in a topology. scene: with the parameters by which the body is split."""
+    pose, splitting, fixed = simulation.scene.objects[body.index].pose, simulation.world.splitting, simulation.fixed
+    row_start, columns = simulation.system.body_pattern(body.first, body.last)
+    rest, tets, triangles = body.mesh.rest, body.mesh.tets, surface_triangles(body.mesh.tets)
+    if splitting is not None and simulation.system.followed is not None:
+        row_start, columns = simulation.system.followed.body_pattern(scene, body.first, body.last)
+        fixed = fixed[splitting.nodes(scene, "root")]
+        if body.index in splitting.splitters:
+            split = splitting.of(scene, body.index)
+            rest, tets = rest[split.root], split.tets
+            triangles = splitting.splitters[body.index].faces.surface(np.ones(len(tets)), tets, split.closed)
+    message.rest = _bytes(posed(rest, pose.rotate, pose.translate), "<f8")
+    message.tets, message.triangles = _bytes(tets, "<i4"), _bytes(triangles, "<i4")
+    message.row_start, message.columns = _bytes(row_start, "<i4"), _bytes(columns, "<i4")
+    message.fixed = _bytes(np.flatnonzero(fixed[body.nodes]), "<i4")
+    if any(pose.rotate) or any(pose.translate):
+        message.reference = _bytes(rest, "<f8")
 
 
 def moduli(simulation: Simulation, body: Body, message: pb.Topology) -> None:
@@ -113,11 +124,11 @@ def add_places(points: list[NamedPoints], status: pb.Status) -> None:
 
 
 def state(
-    body: Body, step: int, time: float, x: NDArray[np.float64], v: NDArray[np.float64], cut: int = 0
+    body: Body, step: int, time: float, x: NDArray[np.float64], v: NDArray[np.float64], cut: int = 0, epoch: int = 1
 ) -> pb.State:  # fmt: skip
     """Converts a frame of one object. x, v: positions [m] and velocities [m/s] of all nodes of the scene."""
     return pb.State(
-        header=pb.Header(object=body.name, epoch=1),
+        header=pb.Header(object=body.name, epoch=epoch),
         step=step,
         time=time,
         nodes=body.last - body.first,

@@ -154,7 +154,7 @@ class Recording:
         found = self.objects.setdefault(message.object, RecordedObject())
         if kind == "topology":
             topology = pb.Topology.FromString(data)
-            if not topology.cut:  # a cut follows from the parameters
+            if found.topology is None:  # others follow from the parameters
                 found.topology = topology
         elif kind == "state":
             found.frames[pb.State.FromString(data).step] = message.offset, message.number

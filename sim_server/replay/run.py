@@ -38,6 +38,7 @@ from sim_server.simulation import Simulation
 from sim_server.state import code
 from sim_server.state.start import Start
 from sim_server.updates.factor_source import Inline, Job
+from sim_server.updates.patterns import Patterns
 from sim_server.updates.worker_assembly import Assembly, mesh_of_topology
 
 if TYPE_CHECKING:
@@ -74,7 +75,6 @@ class Replay:
             ) from error
         self.engine, self.bodies = self.simulation.engine, self.simulation.world.bodies
         self.compared = Comparison(recording)
-        self._same_meshes()
         self._same_obstacles()
         self._taken = {b.name: taken_up(self._rows(b.name), recording.first) for b in self.bodies}
         self._last_use = self._last_uses()
@@ -93,6 +93,7 @@ class Replay:
         self._saved = SavedFactors([], [])
         if recording.checkpoint:
             self._resume(recording)
+        self._same_meshes()
         self._nodes: dict[int, tuple[NDArray[np.int32], Float64]] = {}  # nodes and offsets of interactions, by id
         self._inline = self._library()
         self._positions: dict[str, Float64] = {}  # sent instead of a matrix, and not those of its step, by body
@@ -211,7 +212,6 @@ class Replay:
 
     def _library(self) -> Inline:
         """Returns a source of factors that uses the library named in the log, if it is installed."""
-        system = self.simulation.system
         made = [f for o in self.recording.objects.values() for f in o.factors.values()]
         recorded = {f.library for f in made if f.library} - {"native"}  # which is everywhere
         wanted = {_library(name) for name in recorded}
@@ -222,7 +222,7 @@ class Replay:
             self.compared.notes.append(
                 f"factors of the log were made by {', '.join(sorted(recorded))}; here by another"
             )
-        return Inline({b.name: system.body_pattern(b.first, b.last) for b in self.bodies}, choice)
+        return Inline(Patterns.of(self.simulation), choice)
 
     # --- input of a step ----------------------------------------------------------------------------------------
 
@@ -325,7 +325,8 @@ class Replay:
             values = self._assemblies[body.name].matrix(self._positions[body.name])
         use = self.recording.objects[body.name].factors.get(made)
         method = solver.method_named(use.method if use is not None else "")
-        self._inline.submit(Job(body.name, 1, made, warped, values, solver.factor_dtype, method))
+        epoch = self.simulation.epoch(body.name, made)
+        self._inline.submit(Job(body.name, epoch, made, warped, values, solver.factor_dtype, method))
 
     def _collect(self, step: int) -> None:
         for factor in self._inline.poll():

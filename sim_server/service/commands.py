@@ -138,6 +138,8 @@ class Commands:
         for p in command.parameters:
             if p.key.endswith("cutting.removed"):
                 raise BadCommand(f"{p.key[:80]}: elements are removed by the command cut, and come back by reset")
+            if p.key.endswith("cutting.opened"):
+                raise BadCommand(f"{p.key[:80]}: faces are opened by the command cut with split, and closed by reset")
             if len(p.key) > LONGEST_KEY or len(p.value) > LONGEST_VALUE:
                 raise BadCommand(
                     f"{p.key[:40]}...: at most {LONGEST_KEY} characters of a key, {LONGEST_VALUE} of a value"

@@ -40,7 +40,8 @@ class Tearing:
                 self._gradients[body.index] = shape_gradients(body.mesh.rest, body.mesh.tets)[1]
             limit = scene.objects[body.index].effects["cutting"].tear  # type: ignore[attr-defined]
             there = present(scene, [body]) > 0
-            seen = torn(x[body.nodes], body.mesh.tets, self._gradients[body.index], there, limit)
+            tets = body.mesh.tets if world.splitting is None else world.splitting.tets(scene, body) - body.first
+            seen = torn(x[body.nodes], tets, self._gradients[body.index], there, limit)
             found, self._seen[body.index] = np.intersect1d(seen, self._seen.get(body.index, seen[:0])), seen
             if len(found):
                 values |= removal(scene, body, found)

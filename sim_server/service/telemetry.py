@@ -65,6 +65,7 @@ class Telemetry:
         self.contact = ContactTelemetry(self.simulation, link, recorder)
         self.reactions = ReactionTelemetry(self.simulation, link)
         self.cuts = CutTelemetry(self.simulation, link, recorder, patient)
+        driver.on_epoch.append(self.cuts.announce)
         self.replay_recorder = ReplayRecorder(driver, link, recorder) if recorder and commands else None
         self.started = time.monotonic()
         self.record_every = self.simulation.scene.record.every if recorder else 0
@@ -234,8 +235,8 @@ class Telemetry:
 
     def _state(self, body: Body, step: int, x: Float64, v: Float64, shown: int | None = None) -> pb.State:
         """shown: step whose surface it has, that of the frame if left out."""
-        cut = self.cuts.number(body.name, step if shown is None else shown)
-        return messages.state(body, step, step * self.simulation.world.dt, x, v, cut)
+        cut, epoch = self.cuts.number(body.name, step if shown is None else shown)
+        return messages.state(body, step, step * self.simulation.world.dt, x, v, cut, epoch)
 
     def on_reset(self, name: str, show: bool) -> None:
         """Takes note that an object, or all, were put back to the start. show: to viewers, as no step follows soon."""

@@ -23,7 +23,7 @@ DERIVED = frozenset({
     "pull",  # of pushes and grabs
 })  # fmt: skip
 TOTALS = frozenset({  # counted or first times of a run, or what factors have to know: no reset takes it back
-    "refused", "dropped", "left_before", "changed_at", "at_rest",
+    "refused", "dropped", "left_before", "changed_at", "at_rest", "copied_at",
 })  # fmt: skip
 
 

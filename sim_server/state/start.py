@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from sim_server.backends.state import StateArray
 from sim_server.mechanics.removal import KEY
+from sim_server.mechanics.splitting import KEY as SPLIT
 from sim_server.simulation import Simulation
 from sim_server.state.arrays import launch_arrays, state_arrays
 
@@ -38,7 +39,8 @@ class Start:
         """
         s = self._simulation
         bodies = [s.world.body(name).index] if name else [b.index for b in s.world.bodies]
-        s.parameters.take_back(KEY.format(s.world.bodies[index].name) for index in bodies)
+        names = [s.world.bodies[index].name for index in bodies]
+        s.parameters.take_back(key.format(name) for key in (KEY, SPLIT) for name in names)
         s.engine.take_changes()
         back = self._arrays if not name else [(a, _with_rows(a, v, bodies[0])) for a, v in self._arrays if a.rows]
         for array, value in back:

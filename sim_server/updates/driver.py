@@ -18,10 +18,12 @@ from protocol.factor import Factor
 from sim_server.arrays import Float64
 from sim_server.backends.base import Capability
 from sim_server.backends.cpu.structs import REACTION
+from sim_server.mechanics.world import Body
 from sim_server.simulation import Simulation
 from sim_server.updates.body_state import BodyUpdateState
 from sim_server.updates.factor_check import FactorCheck
 from sim_server.updates.factor_source import FactorSource, Inline, Job
+from sim_server.updates.patterns import Patterns
 from sim_server.updates.policies import make_policy
 from sim_server.updates.scheduler import UpdateRequest
 from sim_server.updates.snapshots import SnapshotPool
@@ -48,10 +50,9 @@ class Driver:
     def __init__(self, simulation: Simulation, source: FactorSource | None = None, counted: bool | None = None):
         self.simulation, self.engine = simulation, simulation.engine
         self.solver = simulation.scene.solver
-        world, system = simulation.world, simulation.system
-        patterns = {b.name: system.body_pattern(b.first, b.last) for b in world.bodies}
+        world, self._patterns = simulation.world, Patterns.of(simulation)
         alone = simulation.scene.uses_factor_alone  # in place of A: it must be exact, so nothing is to choose from
-        self.inline, self.check = Inline(patterns), FactorCheck(patterns, alone)
+        self.inline, self.check = Inline(self._patterns), FactorCheck(self._patterns, alone)
         self.source: FactorSource = source or self.inline
         self.policy = make_policy(self)
         self.counted = not self.policy.free if counted is None else counted
@@ -66,6 +67,7 @@ class Driver:
         self.other_reactions: NDArray[Any] = np.zeros(0, REACTION)
         self.readings: Float64 = np.zeros((0, 0))
         self.on_adopt: list[Callable[[Factor], Any]] = []  # called with every factor that the loop is given
+        self.on_epoch: list[Callable[[Body, int], None]] = []  # called before the first job of an epoch of a body
         self.snapshots = SnapshotPool(simulation, self.source, self.policy.expected_latency)
         self.useless_factors = UselessFactors(self)
         self._observer = SolveObserver(self)
@@ -136,10 +138,19 @@ class Driver:
         """Returns the job of the copy that the loop has made for a body. None: the copy does not suffice and is
         discarded."""
         assert state.job.copy is not None
-        if self.snapshots.suffices(state):
+        if self.snapshots.suffices(state) and self._is_present(state):
             return self._job(state, self.snapshots.step(state), state.job.copy)
         self.snapshots.discard(state)
         return None
+
+    def _is_present(self, state: BodyUpdateState) -> bool:
+        """False if the copy is of a matrix from before the body was split for the last time, or after it."""
+        s, body = self.simulation, state.body
+        if s.splits is None:
+            return True
+        epoch = s.epoch(body.name, self.snapshots.step(state))
+        blocks = int(s.system.row_start[body.last] - s.system.row_start[body.first])
+        return epoch == s.epoch(body.name, s.engine.step) and blocks == len(self._patterns.at(body.name, epoch)[1])
 
     def assembled_job(self, state: BodyUpdateState) -> Job:
         """Returns the job of the matrix of a body as last assembled; between `assemble` and `solve` of the engine."""
@@ -148,10 +159,15 @@ class Driver:
         return self._job(state, step, values)
 
     def _job(self, state: BodyUpdateState, step: int, values: NDArray[np.float64]) -> Job:
-        name = state.body.name
+        name, epoch = state.body.name, self.simulation.epoch(state.body.name, step)
+        if self.simulation.splits is not None and values.ndim == 3:  # the copy has room for more blocks
+            values = values[: len(self._patterns.at(name, epoch)[1])]
+        if self.source.epoch(name) not in (None, epoch):
+            for begin in self.on_epoch:
+                begin(state.body, epoch)
         method = self.solver.method if state.tuner is None else state.tuner.factorization.method
         state.on_job(step, method)
-        return Job(name, 1, step, self._warped[name], values, self.solver.factor_dtype, method)
+        return Job(name, epoch, step, self._warped[name], values, self.solver.factor_dtype, method)
 
     # --- factors in ---------------------------------------------------------------------------------------------
 

@@ -7,6 +7,7 @@ all of it; a factor that takes off less than block Jacobi does is worth less tha
 """
 
 import ctypes as c
+from collections.abc import Mapping
 from functools import cache
 from typing import NamedTuple
 
@@ -17,6 +18,7 @@ from protocol.factor import Factor
 from sim_server.backends.compiler import native
 from sim_server.backends.cpu import structs
 from sim_server.backends.cpu.engine import NativeFactor
+from sim_server.updates.patterns import Patterns
 
 Reals = NDArray[np.float64]
 MAX_RESIDUAL = 0.05  # |r - A P^-1 r| / |r| of a factor that is to take the place of A; exact ones in float32 have 1e-3
@@ -50,12 +52,14 @@ def _library() -> c.CDLL:
 class FactorCheck:
     """Checks factors of some objects.
 
-    patterns: row_start and columns of A by object, nodes numbered from 0
+    patterns: row_start and columns of A by object, nodes numbered from 0, or those of all epochs
     alone: factors are to take the place of A, so they must be exact
     """
 
-    def __init__(self, patterns: dict[str, tuple[NDArray[np.int32], NDArray[np.int32]]], alone: bool = False):
-        self._patterns, self._alone = patterns, alone
+    def __init__(
+        self, patterns: Patterns | Mapping[str, tuple[NDArray[np.int32], NDArray[np.int32]]], alone: bool = False
+    ):
+        self._patterns, self._alone = patterns if isinstance(patterns, Patterns) else Patterns(patterns), alone
         self._arrays: dict[int, tuple[Reals, Reals]] = {}  # by size: probe vector, work
 
     def prepare(self) -> None:
@@ -68,7 +72,7 @@ class FactorCheck:
         matrix: values (blocks, 3, 3) that it was made from; None: not known, and the test against block Jacobi is left
             out
         """
-        nodes = len(self._patterns[factor.object][0]) - 1
+        nodes = len(self._patterns.at(factor.object, factor.epoch)[0]) - 1
         if factor.pattern.size != 3 * nodes:
             return f"its size is {factor.pattern.size}, that of the object {3 * nodes}"
         if len(factor.values) != factor.pattern.nonzeros:
@@ -89,7 +93,7 @@ class FactorCheck:
 
     def probe(self, factor: Factor, matrix: Reals | None) -> Probe:
         """Applies a factor, which has the right size, to the probe vector r."""
-        row_start, columns = self._patterns[factor.object]
+        row_start, columns = self._patterns.at(factor.object, factor.epoch)
         nodes = len(row_start) - 1
         n = 3 * nodes
         if n not in self._arrays:

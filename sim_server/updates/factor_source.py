@@ -13,6 +13,7 @@ import numpy as np
 from protocol.factor import Factor
 from protocol.method import Method
 from sim_server.arrays import Float64, Int32
+from sim_server.updates.patterns import Patterns
 
 if TYPE_CHECKING:
     from precond_worker.factorization.registry import Factorization
@@ -71,6 +72,10 @@ class FactorSource(Protocol):
         """Number of workers that may be given jobs, idle or busy."""
         return 1
 
+    def epoch(self, name: str) -> int | None:
+        """Returns the epoch of an object whose jobs it takes; None: of all."""
+        return None
+
     def assembles_matrices(self) -> bool:
         """True if there are workers and all of them can assemble matrices from positions."""
         return False
@@ -105,15 +110,17 @@ class FactorSource(Protocol):
 class Inline(FactorSource):
     """Factorizes in this process, during `submit`.
 
-    patterns: block pattern (row_start, columns) of the matrix of each object
+    patterns: block pattern (row_start, columns) of the matrix of each object, or those of all epochs
     library: as in precond_worker.factorization.factorize.Analysis
     """
 
     WORKER = "in process"
 
-    def __init__(self, patterns: dict[str, tuple[Int32, Int32]], library: str = "auto"):
-        self._patterns, self._library = patterns, library
-        self._analyses: dict[tuple[str, Method], Factorization] = {}
+    def __init__(self, patterns: Patterns | Mapping[str, tuple[Int32, Int32]], library: str = "auto"):
+        self._patterns = patterns if isinstance(patterns, Patterns) else Patterns(patterns)
+        self._library = library
+        self._analyses: dict[tuple[str, Method], tuple[int, Factorization]] = {}  # and their epochs
+        self._epochs: dict[str, int] = {}  # of the last job
         self._latest: dict[str, Method] = {}
         self._done: list[Factor] = []
         self._failed: list[tuple[str, str]] = []
@@ -134,6 +141,7 @@ class Inline(FactorSource):
             self._failed.append((job.object, "positions without a worker that could build the matrix"))
             return True
         start = perf_counter()
+        self._epochs[job.object] = job.epoch
         analysis = self._analysis(job.object, job.method)
         try:
             values = analysis.factorize(job.values, np.dtype(job.dtype))
@@ -156,9 +164,11 @@ class Inline(FactorSource):
         from precond_worker.factorization.registry import make_factorization
 
         self._latest[name] = method
-        if (name, method) not in self._analyses:
-            self._analyses[name, method] = make_factorization(*self._patterns[name], method, self._library)
-        return self._analyses[name, method]
+        epoch = self._epochs.get(name, 1)
+        if (name, method) not in self._analyses or self._analyses[name, method][0] != epoch:
+            made = make_factorization(*self._patterns.at(name, epoch), method, self._library)
+            self._analyses[name, method] = epoch, made
+        return self._analyses[name, method][1]
 
     def poll(self) -> list[Factor]:
         """Returns the factors made since the last call."""

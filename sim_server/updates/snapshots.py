@@ -43,7 +43,7 @@ class SnapshotPool:
             engine.request_positions(body.index, job.copy, job.extrapolated)
         else:
             job.extrapolated = 0.0
-            job.copy = self._allocate(self._simulation.system.body_values(body.first, body.last).shape)
+            job.copy = self._allocate((self._simulation.system.most_blocks(body.first, body.last), 3, 3))
             engine.request_matrix(body.index, job.copy)
 
     def step(self, state: BodyUpdateState) -> int:
@@ -86,7 +86,7 @@ class SnapshotPool:
 
     def _recycle(self, copy: NDArray[np.float64]) -> None:
         if copy.base is None:  # not a view of the system's own values
-            self._free[copy.shape].append(copy)
+            self._free.setdefault(copy.shape, []).append(copy)
 
     def _workers_assemble(self, state: BodyUpdateState) -> bool:
         """True if workers can assemble the matrix from positions: all effects are known to them, there is no contact,

@@ -10,6 +10,7 @@ from sim_server.backends.gpu.inverse.build_inverse import InverseBuilder
 from sim_server.backends.gpu.inverse.plan import plan
 from sim_server.backends.gpu.islands import OWN_SURFACES
 from sim_server.checkpoint.content import capture
+from sim_server.errors import InputError
 from sim_server.explain.explanation import explain
 from sim_server.simulation import Simulation
 from sim_server.state.arrays import state_arrays
@@ -332,6 +333,12 @@ def test_bodies_that_are_told_not_to_touch_each_other_have_nothing_of_it(cupy):
     objects = [block(name="low"), block(name="high", at=(0, 0.07, 0))]
     over(floor(), objects=objects, contact={"between": False}, device="gpu")
     assert not any("pair" in kernel or "island" in kernel for kernel, _ in cupy.calls)
+
+
+def test_bodies_are_not_split_on_a_gpu(cupy):
+    """Their pattern would have to change there."""
+    with pytest.raises(InputError, match="spare: objects are split on a CPU alone"):
+        Simulation.load("deploy/scenes/beam.toml", ["object.beam.effects.cutting.spare=9"], "gpu")
 
 
 def test_a_scene_with_attachments_and_springs_alone_is_built(cupy):

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_server.mechanics.removal import text_of
+from sim_server.mechanics.numbers import text_of
 from sim_server.scene.model import Scene
 from sim_server.simulation import Simulation
 

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from sim_server.mechanics.cut_shapes import in_sphere, met_by_blade, torn
-from sim_server.mechanics.removal import numbers_of, text_of
+from sim_server.mechanics.numbers import numbers_of, text_of
 from sim_server.mesh import bar
 from sim_server.mesh.faces import Faces
 from sim_server.mesh.shape_functions import shape_gradients

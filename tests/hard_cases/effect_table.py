@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from sim_server.mechanics.removal import text_of
+from sim_server.mechanics.numbers import text_of
 from sim_server.simulation import Simulation
 from tests.hard_cases.of_effects import (
     TOLD,

@@ -14,7 +14,8 @@ from protocol.factor import Factor
 from sim_server.effects._movable import MoveError
 from sim_server.effects.touch import TouchError
 from sim_server.errors import InputError
-from sim_server.mechanics.removal import KEY, text_of
+from sim_server.mechanics.numbers import text_of
+from sim_server.mechanics.removal import KEY
 from sim_server.mechanics.world import Body
 from sim_server.mesh import bar
 from sim_server.parameters import BadParameter, toml

@@ -26,6 +26,8 @@ def test_what_is_set_is_as_if_it_had_been_in_the_scene(name):
         for a, b in zip(one.engine.launches, other.engine.launches, strict=True):
             assert a.name == b.name
             for key, array in a.arrays.items():
+                if key in ("changed_at", "copied_at"):  # when nodes lost elements, or were copied
+                    continue
                 assert np.array_equal(array, b.arrays[key], equal_nan=True), (a.name, key)
 
 

@@ -106,3 +106,49 @@ def reset_after_a_cut(client: Client) -> None:
 def test_a_reset_makes_whole_and_is_repeated(tmp_path: Path) -> None:
     log = recorded(tmp_path, touch=reset_after_a_cut, effects="cutting = true\n")
     assert replayed(log, 0)["same"]
+
+
+def split_about(client: Client) -> None:
+    """A blade into the beam, one through it, what is refused; workers go on with the new pattern."""
+    until(lambda: fresh(client).step > 2 and fresh(client).objects[0].factors_used > 0, "a factor came")
+    client.pause()
+    whole = client.meshes()["beam"]
+    into = [(-5, -20, 1.45), (0.5, -20, 1.45), (0.5, 20, 1.45), (-5, 20, 1.45)]
+    reply = client.cut("beam", blade=into, split=True)
+    assert (reply.removed, reply.left) == (0, TETS) and reply.opened > 0 and reply.copied > 0
+    again = client.cut("beam", blade=into, split=True)
+    assert (again.opened, again.copied) == (0, 0), "these faces are open"
+    client.step(4)
+    until(
+        lambda: len(client.meshes()["beam"].triangles) == len(whole.triangles) + 2 * reply.opened, "its lips are seen"
+    )
+    where = ("--connect", endpoint_of(client))
+    said = run("clients", "cut", "--object", "beam", "--split", "--where", "Z > 2.8", "--json", *where)
+    assert said.returncode == 0 and json.loads(said.stdout)["copied"] == 16, said.stderr
+    with pytest.raises(BadInput, match="more spare nodes"):
+        client.cut("beam", where="X > 0.34 and X < 0.6 or Y > 0.4", split=True)
+    with pytest.raises(BadInput, match="closed by reset"):
+        client.set("beam.cutting.opened", '""')
+    assert not any("opened" in p.now.key for p in client.parameters())
+    client.step(5)
+    assert client.cut("beam", where="Z > 3.9").removed >= 0
+    client.resume()
+    made = fresh(client).objects[0].factors_used
+    until(lambda: fresh(client).objects[0].factors_used > made + 1, "factors of the split body come")
+    assert fresh(client).objects[0].tets == len(client.meshes()["beam"].tets)
+
+
+def test_splits_are_in_the_log_and_repeated_bit_for_bit(tmp_path: Path) -> None:
+    log = recorded(tmp_path, touch=split_about, effects="cutting = { spare = 60 }\n")
+    found = messages(log, "parameters")
+    assert sum(p.key.endswith("cutting.opened") for m in found for p in m.parameters) == 2
+    with Log(log) as opened:
+        assert opened.complete
+        frames = list(opened.frames("beam"))
+        meshes = [opened.mesh("beam", frame.epoch) for frame in frames]
+        assert len({frame.epoch for frame in frames}) >= 3
+        assert len(np.unique(meshes[-1].tets)) > len(np.unique(meshes[0].tets))
+        for frame, mesh in zip(frames, meshes, strict=True):
+            edges = frame.x[mesh.tets[:, 1:]] - frame.x[mesh.tets[:, :1]]
+            assert (np.linalg.det(edges) > 0).all() and len(mesh.rest) == len(frame.x), "copies are where they belong"
+    assert replayed(log, 0)["same"]

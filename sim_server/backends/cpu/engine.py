@@ -424,6 +424,9 @@ class _NativeCut:
             "room": np.zeros(3 * n),
         }  # fmt: skip
         room |= {name: getattr(given, name)[body.first : body.last] for name in ("at_rest", "changed_at", "free")}
+        if given.origin is not None and given.copied_at is not None:
+            room |= {"origin": given.origin[body.first : body.last], "root": np.zeros(n, np.int32)}
+            room["copied_at"] = given.copied_at[body.first : body.last]
         self._room = room
         self.native = structs.CutNodes(nodes=n, capacity=capacity, dt=dt)
         for name, array in room.items():
@@ -443,9 +446,17 @@ class CpuEngine(Reports):
 
     def __init__(self, given: EngineInput, records: int = 8192, frames: int = 8):
         self._native = _library()
+        spawn = given.cut.spawn if given.cut else None
         others = [part.launches for part in (given.stages, given.euler, given.substeps, given.halving) if part]
         listed = cast(
-            list[CpuLaunch], [*given.assemble, *given.integrate, *(x for part in others for x in part), *given.history]
+            list[CpuLaunch],
+            [
+                *given.assemble,
+                *given.integrate,
+                *(x for part in others for x in part),
+                *given.history,
+                *([spawn] if spawn else []),
+            ],
         )
         launches = list({id(launch): launch for launch in listed}.values())  # some take part in several stages
         arrays, ranges = given.arrays, given.ranges
@@ -480,6 +491,13 @@ class CpuEngine(Reports):
             self._newton = _NativeNewton(given.newton, late, loop, self._launch)
         number = {id(launch): k for k, launch in enumerate(launches)}
         self._history = np.array([number[id(launch)] for launch in given.history], np.int32)
+        if spawn:
+            loop.spawn = c.addressof(self._launch[number[id(spawn)]])
+            blocks = [k for k, launch in enumerate(launches) if launch.domain == "blocks"]
+            self._of_blocks = np.array(blocks, np.int32)
+            loop.of_blocks, loop.blocks_launches = self._of_blocks.ctypes.data, len(blocks)
+            for k in blocks:
+                self._bindings[k].items = (int(arrays["row_start"][nodes]) - nodes) // 2
         loop.history, loop.histories, loop.advanced = self._history.ctypes.data, len(self._history), -1
         self._stages = given.stages and _NativeStages(given.stages, loop, self._launch, number)
         self._euler = given.euler and _NativeEuler(given.euler, loop, self._launch, number)

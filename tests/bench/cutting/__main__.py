@@ -9,7 +9,7 @@ import numpy as np
 import typer
 
 from sim_server.effects.cutting import Cutting
-from sim_server.mechanics.removal import text_of
+from sim_server.mechanics.numbers import text_of
 from sim_server.scene import where
 from sim_server.scene.model import Scene
 from sim_server.simulation import Simulation

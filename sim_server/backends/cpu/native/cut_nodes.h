@@ -2,9 +2,12 @@
 // Keeps a factor useful after elements were removed (effects/cutting.py). With T the nodes that lost or got back elements since the
 // factor's matrix and their neighbours, and S the inverse of A on T, the symmetric multiplicative Schwarz method
 //     z = S r + (I - S A) P^-1 (I - A S) r
-// is exact on T and positive definite if P is. Nodes without elements, whose rows of A are the identity, are set apart: z = 0 there.
+// is exact on T and positive definite if P is. Nodes that were copied since, where the body was split along faces, have rows that P
+// knows nothing of: M P^-1 M^T takes its place, M the map by which they move as the nodes did of which they are copies. On the motion
+// that they have in common this is P^-1 of the whole body, and S is for what sets them apart. Nodes without elements, whose rows of A are the identity, are set apart: z = 0 there.
 // S is a Cholesky factor with an envelope, in the order of Cuthill and McKee, made in each solve, since A changes. Where that costs
-// too much (ENOUGH_FOR_CUTS), the neighbours are left out, then all of T and only the nodes without elements are set apart.
+// too much (ENOUGH_FOR_CUTS), the neighbours are left out, then all of T: only the nodes without elements are set apart, and the
+// inverses of their own blocks are added for copies and what they are copies of.
 // (Smith, Bjorstad and Gropp, Domain Decomposition, 1996, section 1.3; George and Liu, Computer Solution of Large Sparse Positive
 // Definite Systems, 1981, chapter 4.)
 #pragma once
@@ -24,6 +27,11 @@ struct CutNodes {          // of a body whose elements may be removed
     const double* at_rest;     // (nodes,) 1 at nodes without elements
     const double* changed_at;  // (nodes,) when the node lost or got back an element [s]
     const double* free;        // (nodes,) 0 at fixed nodes
+    const int32_t* origin;     // (nodes,) node of the scene that each was copied from, itself or -1; null: the body is never split
+    const double* copied_at;   // (nodes,) since when it is a copy [s]
+    int32_t* root;             // (nodes,) node of the body that the factor's matrix had in the place of each
+    int32_t copies;            // nodes that it did not have
+    int32_t groups;            // nodes with inverse blocks in `envelope`: copies and their roots, where T is left out
     int32_t *node, *place;     // (nodes,) T, in its order; place of each node in it, -1: not there
     int32_t* first;            // (3 nodes,) first column of each row
     int64_t* row;              // (3 nodes,) where the entry of column 0 of each row would be in `envelope`
@@ -40,23 +48,32 @@ struct CutSolve {
 
     // Finds T and factorizes A on it. step: of the factor's matrix
     void prepare(int64_t step) {
+        const double since = c.start_time + (step + 0.5) * c.dt;
+        find_copies(since);
         for (int rings = 1; rings >= 0; --rings) {  // with the neighbours, unless that is too much
-            mark(c.start_time + (step + 0.5) * c.dt);
+            mark(since);
             if (!c.wanted) return;
             if (rings) widen();
             sort();
             if (!assemble()) continue;
             if (factorize()) c.count = c.wanted;
-            return;
+            break;
         }
+        if (c.copies && !c.count) invert_groups();
     }
 
-    bool works() const { return c.count > 0 || c.gone > 0; }
+    bool works() const { return c.count > 0 || c.gone > 0 || c.copies > 0; }
 
     // z = S r + (I - S A) P^-1 (I - A S) r. apply(from, z): z = P^-1 from
     template <class F> void around(const double* r, double* z, F apply) {
         if (!c.count) {
-            apply(r, z);
+            if (c.copies) {
+                std::copy(r, r + 3 * c.nodes, c.room);
+                apply_whole(c.room, z, apply);
+                add_groups(r, z);
+            } else {
+                apply(r, z);
+            }
             set_apart(z);
             return;
         }
@@ -69,7 +86,7 @@ struct CutSolve {
                 for (int m = 0; m < 3; ++m) c.room[3 * j + m] -= a[m] * t[0] + a[3 + m] * t[1] + a[6 + m] * t[2];
             });
         }
-        apply(c.room, z);
+        apply_whole(c.room, z, apply);
         set_apart(z);
         double* s = c.room;
         for (int k = 0; k < c.count; ++k) {  // A z on T
@@ -87,6 +104,48 @@ private:
     // f(node of the body, block) of the blocks in a node's row of A.
     template <class F> void each_block(int i, F f) const {
         for (int64_t k = A.row_start[A.first + i]; k < A.row_start[A.first + i + 1]; ++k) f(A.columns[k] - A.first, A.values + 9 * k);
+    }
+
+    // z = M P^-1 M^T r, M the map by which copies that the factor does not know of move as the nodes that it has in their place.
+    // Changes r.
+    template <class F> void apply_whole(double* r, double* z, F apply) {
+        for (int i = 0; c.copies && i < c.nodes; ++i)
+            for (int m = 0; c.root[i] != i && m < 3; ++m) r[3 * c.root[i] + m] += r[3 * i + m], r[3 * i + m] = 0;
+        apply(r, z);
+        for (int i = 0; c.copies && i < c.nodes; ++i)
+            for (int m = 0; c.root[i] != i && m < 3; ++m) z[3 * i + m] = z[3 * c.root[i] + m];
+    }
+
+    // Finds the nodes that the factor's matrix had in the place of copies made after a time.
+    void find_copies(double since) {
+        c.copies = c.groups = 0;
+        for (int i = 0; c.origin && i < c.nodes; ++i) {
+            int from = i;
+            while (c.origin[from] >= 0 && c.origin[from] - A.first != from && c.copied_at[from] > since) from = c.origin[from] - A.first;
+            c.root[i] = from;
+            c.copies += from != i;
+        }
+    }
+
+    // Inverse blocks of copies and their roots: where T is left out these alone tell them apart.
+    void invert_groups() {
+        for (int i = 0; i < c.nodes; ++i) c.place[i] = -1;
+        for (int i = 0; i < c.nodes; ++i)
+            if (c.root[i] != i) c.place[i] = c.place[c.root[i]] = -2;
+        for (int i = 0; i < c.nodes && 9 * (int64_t)(c.groups + 1) <= c.capacity; ++i) {
+            if (c.place[i] != -2) continue;
+            double* own = c.envelope + 9 * (int64_t)c.groups;
+            each_block(i, [&](int j, const double* a) { if (j == i) invert3(a, true, own); });
+            c.node[c.groups++] = i;
+        }
+    }
+
+    void add_groups(const double* r, double* z) const {
+        for (int k = 0; k < c.groups; ++k) {
+            double y[3];
+            multiply3(c.envelope + 9 * (int64_t)k, r + 3 * c.node[k], y);
+            for (int m = 0; m < 3; ++m) z[3 * c.node[k] + m] += y[m];
+        }
     }
 
     void set_apart(double* z) const {

@@ -22,8 +22,12 @@ static void take_mail(Launch& l, int64_t step) {
     }
 }
 
-static void copy_all(const Changes& changes) {
+static void copy_all(const Loop& loop, const Changes& changes) {
     for (int i = 0; i < changes.count; ++i) std::memcpy(changes.copies[i].target, changes.copies[i].source, changes.copies[i].bytes);
+    if (!loop.spawn) return;
+    run(*loop.spawn, loop.threads);
+    for (int i = 0; i < loop.blocks_launches; ++i)
+        loop.launch[loop.of_blocks[i]].binding->items = (loop.row_start[loop.nodes] - loop.nodes) / 2;
 }
 
 // Makes the changes of parameters that wait. What they add to the elastic energy of the present state counts as work.
@@ -35,11 +39,11 @@ static void take_changes(Loop& loop) {
         std::vector<double> before(loop.bodies);
         measure_elastic(loop);
         for (int i = 0; i < loop.bodies; ++i) before[i] = loop.energies->balance[i].elastic;
-        copy_all(*next);
+        copy_all(loop, *next);
         measure_elastic(loop);
         for (int i = 0; i < loop.bodies; ++i) add_work(loop.energies->balance[i], loop.energies->balance[i].elastic - before[i]);
     } else {
-        copy_all(*next);
+        copy_all(loop, *next);
     }
     if (loop.substeps) loop.substeps->state.since = ESTIMATE_EVERY;
     next->taken.store(loop.rings.step, std::memory_order_release);

@@ -189,6 +189,9 @@ struct Loop {
     int32_t launches, before;          // launches; how many of them assemble (the others integrate)
     Launch* launch;
     const Launch* touch;               // pushes and grabs, or null
+    const Launch* spawn;               // begins copies of nodes after parameters have changed, or null
+    const int32_t* of_blocks;          // with it, numbers of launches over the blocks above the diagonal, whose number changes
+    int32_t blocks_launches;
     const int32_t* history;            // numbers of launches that begin every step, once
     int32_t histories;
     int64_t advanced;                  // steps completed when they ran last, -1: they have not
