@@ -165,7 +165,7 @@ class CutTelemetry:
         }  # steps before the first with it, number, and epoch, of cuts
         self._unwritten: dict[str, deque[tuple[pb.Topology, float]]] = {
             b.name: deque(maxlen=1) for b in bodies
-        }  # what the log had no room for, and from when it holds [s]: the newest, as no frame of earlier ones is written
+        }  # the newest that the log had no room for, and from when it holds [s]; no frame of earlier ones is written
         self._skins: dict[str, Int64] = {}  # element of each vertex
         self._announced: dict[str, int] = {}  # epochs of objects, but for the first
         self._lock = Lock()
