@@ -2,6 +2,9 @@
 """What cuts cost: iterations right after a cut with factors from before it, and steps while a body is cut."""
 
 import statistics
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -9,7 +12,9 @@ import numpy as np
 import typer
 
 from sim_server.effects.cutting import Cutting
+from sim_server.mechanics.cut_shapes import border
 from sim_server.mechanics.numbers import text_of
+from sim_server.mechanics.splitting import opening
 from sim_server.scene import where
 from sim_server.scene.model import Scene
 from sim_server.simulation import Simulation
@@ -45,8 +50,21 @@ CARVED = (
 )
 
 
-def made(cells: list[int], preconditioner: str, update: str, device: str = "cpu") -> Simulation:
-    body = SCENE["object"][0] | {"mesh": {"bar": cells, "size": [1, 1, 4], "split": "mirrored"}}  # type: ignore[index]
+SPLITS = {  # what of the beam is split off
+    "into, a fifth": "Z > 2 and Y > 0.8", "into, half": "Z > 2 and Y > 0.5", "corner": "Z > 3.4 and Y > 0.5",
+    "through": "Z > 2", "three times": "1.2 < Z < 2 or Z > 2.8",
+}  # fmt: skip
+SPLIT = (
+    "The same with faces opened around a region of the beam, and no element removed "
+    "([how](../preconditioners.md#when-an-object-is-split)). *plain*: as if copies of nodes had been there without "
+    "elements when the factor was made.",
+)
+
+
+def made(cells: list[int], preconditioner: str, update: str, device: str = "cpu", spare: int = 0) -> Simulation:
+    body: dict[str, Any] = SCENE["object"][0] | {"mesh": {"bar": cells, "size": [1, 1, 4], "split": "mirrored"}}  # type: ignore[index]
+    if spare:
+        body["effects"] = body["effects"] | {"cutting": {"spare": spare}}
     solver = {"preconditioner": preconditioner, "update": update, "max_iterations": 2000}
     return Simulation(Scene.model_validate(SCENE | {"object": [body], "solver": solver}), device)
 
@@ -90,6 +108,43 @@ def after_a_cut(cells: list[int]) -> list[dict[str, Any]]:
         rows.append(row)
         print(row, flush=True)
     return rows
+
+
+def iterations_split(cells: list[int], what: str, method: str) -> tuple[int, int, int]:
+    """Most iterations of the steps after a split, faces that it opened, and nodes that it copied."""
+    update = "every-1" if method == "new factor" else f"lockstep-{AGE}"
+    sim = made(cells, "block_jacobi" if method == "block Jacobi" else "cholesky", update, spare=300)
+    assert sim.world.splitting is not None
+    driver, splitter = Driver(sim), sim.world.splitting.splitters[0]
+    driver.advance(BEFORE)
+    faces = border(where.mask(what, sim.world.bodies[0].centroids), splitter.faces.owners)
+    sim.parameters.set(opening(splitter, "", faces))
+    copied = sim.world.splitting.of(sim.parameters.scene, 0).used
+    return int(driver.advance(AFTER)["iterations"].max()), len(faces), copied
+
+
+def after_a_split(cells: list[int]) -> list[dict[str, Any]]:
+    """A row for each split."""
+    rows = []
+    for name, what in SPLITS.items():
+        row: dict[str, Any] = {"split": name, "faces": 0, "copies": 0}
+        for method in METHODS:
+            with without_correction() if method == "plain old factor" else nullcontext():
+                row[method], row["faces"], row["copies"] = iterations_split(cells, what, method)
+        rows.append(row)
+        print(row, flush=True)
+    return rows
+
+
+@contextmanager
+def without_correction() -> Iterator[None]:
+    """Factors from before a split are used as they are."""
+    kept = Cutting.cut_input
+    Cutting.cut_input = lambda self: replace(kept(self), bodies=[])  # type: ignore[method-assign]
+    try:
+        yield
+    finally:
+        Cutting.cut_input = kept  # type: ignore[method-assign]
 
 
 def course(cells: list[int], steps: int, cut: bool, device: str) -> tuple[Any, Any, int]:
@@ -159,11 +214,14 @@ def main(
     report.say(*EXPLAINED, "## Iterations after a cut")
     report.table(rows)
     report.figure(picture(rows), "cutting.png", "Iterations of the worst step after a cut.")
+    splits = after_a_split([3, 3, 8] if quick else [5, 5, 20])
+    report.say("## Iterations after a split", *SPLIT)
+    report.table(splits)
     carving = while_cutting(sizes, steps, rounds, device)
     report.say("## Steps while a body is cut", *CARVED)
     report.table(carving)
     report.remember(rows, ("cut",), METHODS)
-    report.data |= {"iterations": rows, "steps": carving}
+    report.data |= {"iterations": rows, "splits": splits, "steps": carving}
     report.write()
 
 
