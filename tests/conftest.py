@@ -45,7 +45,8 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     if hasattr(config, "workerinput"):
         items.sort(key=lambda item: _group(item.nodeid) != "real time")
     long = set(LONG.read_text().splitlines())
-    if config.args_source is config.ArgsSource.TESTPATHS and (unknown := long - {item.nodeid for item in items}):
+    whole = config.args_source is config.ArgsSource.TESTPATHS and not hasattr(config, "workerinput")
+    if whole and (unknown := long - {item.nodeid for item in items}):
         raise pytest.UsageError(f"{LONG}: no such test: {', '.join(sorted(unknown))}")
     for item in items:
         if item.nodeid in long:

@@ -7,6 +7,7 @@ import pytest
 
 from tests.arrows import PACKAGES, ROOT, Graph, arrows, cycles, floors, private_accesses, report, upward, within
 
+LONG = ROOT / "tests" / "long_tests.txt"
 SMALL = ("protocol", "precond_worker", "clients")
 MOST_FILES = 12  # of a folder of theirs, without __init__.py
 PRIVATE_NAMES = 15  # that tests may use, fewer than
@@ -77,6 +78,14 @@ def test_folders_stay_small(package: str) -> None:
     for folder in {path.parent for path in (ROOT / package).rglob("*.py")}:
         files = [path.name for path in folder.glob("*.py") if path.name != "__init__.py"]
         assert len(files) <= MOST_FILES, f"{folder.relative_to(ROOT)} holds {len(files)} files"
+
+
+def test_tests_that_are_left_out_are_there() -> None:
+    """Names of files and functions; the cases too where all tests are collected by one process (conftest.py)."""
+    lines = LONG.read_text().splitlines()
+    listed = {(path, name) for path, _, name in (line.partition("[")[0].partition("::") for line in lines)}
+    texts = {path: (ROOT / path).read_text() if (ROOT / path).is_file() else "" for path, _ in listed}
+    assert [f"{path}::{name}" for path, name in sorted(listed) if f"def {name}(" not in texts[path]] == []
 
 
 def test_tests_use_few_private_names() -> None:

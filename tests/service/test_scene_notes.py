@@ -12,6 +12,7 @@ from sim_server.simulation import Simulation
 from tests.scenes import bar, jittered_bar, mesh_file, simulation
 
 GRAVITY = (0, -9.81, 0)
+SCENES = Path(__file__).parents[2] / "deploy" / "scenes"
 FALLING = "without fixed nodes: in free fall under gravity"
 
 
@@ -19,7 +20,7 @@ def small(name: str, **table) -> dict:
     return bar((1, 1, 1), (1, 1, 1), name=name, **table)
 
 
-@pytest.mark.parametrize("scene", sorted((Path(__file__).parents[2] / "deploy" / "scenes").glob("*.toml")), ids=str)
+@pytest.mark.parametrize("scene", sorted(SCENES.glob("*.toml")), ids=lambda path: path.name)
 def test_nothing_is_said_of_the_scenes_that_come_along(scene):
     assert scene_notes(Simulation.load(scene)) == []
 
