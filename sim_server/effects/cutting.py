@@ -177,13 +177,21 @@ class Cutting(Effect):
         split = splitting.of(scene, body.index)
         return faces.surface(present(scene, [body]), split.tets, split.closed)
 
-    def with_copies(self, scene: Scene, x: Float64) -> Float64:
-        """Returns positions (n, 3) in which copies that no step has made yet are where they come from."""
-        assert self.world.splitting is not None
-        origin = self.world.splitting.nodes(scene, "origin")
-        for node in np.flatnonzero((origin >= 0) & (self._origin_before < 0)):  # copies follow what they come from
+    def positions(self, scene: Scene) -> Float64:
+        """Returns the positions of all nodes now (n, 3) [m]; of copies not made yet, of what they come from."""
+        w, origin, waiting = self.world, np.zeros(0, np.int32), np.zeros(0, np.int64)
+        if w.splitting is not None:
+            origin = w.splitting.nodes(scene, "origin")
+            waiting = np.flatnonzero((origin >= 0) & (self._origin_before < 0))  # before x is read, which has more then
+        x = w.backend.fetch(w.x).copy()
+        for node in waiting:  # in their order, as copies follow what they come from
             x[node] = x[origin[node]]
         return x
+
+    @property
+    def known_to_workers(self) -> bool:
+        """False where bodies may be split: workers know the mesh of the start, without what it has become."""
+        return self.world.splitting is None
 
     def check(self, effects: Mapping[str, Effect]) -> None:
         """Raises InputError where another effect would go on as if nothing had been removed."""
@@ -232,6 +240,9 @@ class Cutting(Effect):
             body = w.bodies[index]
             if w.rollers is not None and w.rollers.limited[body.nodes].any():
                 raise self._refusal(body, "spare: fixed with along does not go together with splitting")
+        w.free[:] = w.free[
+            w.at_start(lambda scene: splitting.nodes(scene, "root"))
+        ]  # groups have nodes of the mesh alone
         w.free[self.origin < 0] = 1
 
     def _refusal(self, body: Body, why: str) -> InputError:

@@ -62,16 +62,16 @@ class SplitHistory:
 
     def at(self, name: str, step: int) -> int:
         """Returns the epoch of an object in the matrix assembled after `step` completed steps."""
-        return 1 + self._dropped[name] + sum(0 <= change.update.taken <= step for change in self._changes[name])
+        return 1 + self._dropped[name] + sum(0 <= change.update.taken <= step for change in tuple(self._changes[name]))
 
     def pattern(self, name: str, epoch: int) -> Pattern:
         """Returns row_start and columns of A of an object in an epoch, nodes numbered from 0."""
-        taken = [change for change in self._changes[name] if change.update.taken >= 0]
+        taken = [change for change in tuple(self._changes[name]) if change.update.taken >= 0]
         number = epoch - 1 - self._dropped[name]
         return self._start[name] if number <= 0 else taken[number - 1].pattern
 
     def scene(self, name: str, epoch: int) -> Scene | None:
         """Returns the scene with the parameters of an epoch; None: that of the start."""
-        taken = [change for change in self._changes[name] if change.update.taken >= 0]
+        taken = [change for change in tuple(self._changes[name]) if change.update.taken >= 0]
         number = epoch - 1 - self._dropped[name]
         return None if number <= 0 else taken[number - 1].scene

@@ -126,7 +126,8 @@ class FollowedPattern:
         return _padded(value, self.blocks + 1, value[-1]) if place[-1] == "pair_start" else value
 
     def _of(self, scene: Scene) -> tuple[dict[str, NDArray[Any]], list[Stencil]]:
-        if self._last is None or self._last[0] is not scene:
+        last = self._last
+        if last is None or last[0] is not scene:
             from sim_server.mechanics.system import places_of
 
             n, root = self._world.nodes, self._splitting.nodes(scene, "root")
@@ -140,8 +141,8 @@ class FollowedPattern:
                     f"{self.blocks}; more with a larger cutting.spare"
                 )
             arrays = Numbering.of(row, column, n).padded(self.blocks, self.places)
-            self._last = scene, arrays, [place.stencil(n, keys) for place in places]
-        return self._last[1:]
+            last = self._last = scene, arrays, [place.stencil(n, keys) for place in places]
+        return last[1:]
 
 
 def _room(splitting: Splitting) -> int:

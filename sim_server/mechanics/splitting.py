@@ -85,13 +85,16 @@ class Splitter:
     def split(self, text: str) -> Split:
         """Returns what the cuts of a text make of the mesh. Raises ValueError."""
         text = text.strip()
-        if text not in self._known:
-            before, _, last = text.rpartition(";")
-            made = self._cut(self.split(before), self._named(last))
-            while len(self._known) >= KEPT:
-                del self._known[next(key for key in self._known if key)]
-            self._known[text] = made
-        return self._known[text]
+        parts, begun = [], text
+        while (made := self._known.get(begun)) is None:
+            begun, _, last = begun.rpartition(";")
+            begun = begun.strip()
+            parts.append(last)
+        for part in reversed(parts):
+            made = self._cut(made, self._named(part))
+        known = dict(list(self._known.items())[1:][-KEPT:])  # made anew: several threads ask
+        self._known = {"": self.whole} | known | {text: made}
+        return made
 
     def opened_by(self, text: str, faces: Int64) -> str:
         """Returns the text with one cut more, which opens these faces (numbers in `faces`)."""
@@ -173,9 +176,10 @@ class Splitting:
 
     def of(self, scene: Scene, index: int) -> Split:
         """Returns what a scene has made of a body that may be split. Raises InputError."""
-        if self._last is None or self._last[0] is not scene:
-            self._last = scene, {k: split_of(scene, k, each) for k, each in self.splitters.items()}
-        return self._last[1][index]
+        last = self._last
+        if last is None or last[0] is not scene:
+            last = self._last = scene, {k: split_of(scene, k, each) for k, each in self.splitters.items()}
+        return last[1][index]
 
     def tets(self, scene: Scene, body: Body) -> Int32:
         """Returns the elements of any body (m, 4), in node numbers of the scene."""

@@ -194,7 +194,8 @@ class Dispatch(FactorSource):
             return False
         worker = self._choose(idle, job.object)
         matrix_slot, factor_slot = self._allocate_slots(worker, job)
-        lease, now = self._leases.lease(job.object, worker), self._clock()
+        lease = self._leases.lease(job.object, worker, job.method.name, job.positions)
+        now = self._clock()
         in_flight = InFlightJob(
             self._leases.next_number(),
             job.object,
@@ -211,6 +212,7 @@ class Dispatch(FactorSource):
             exclusive_until=now + self._leases.exclusive_period(job.object, known.blocks),
             method=job.method.name,
             payload_bytes=0 if matrix_slot else job.values.nbytes,
+            positions=job.positions,
         )
         self._leases.start(in_flight)
         if self._post(in_flight, job, lease, matrix_slot):

@@ -39,6 +39,7 @@ class InFlightJob:
     exclusive_until: from then on another worker may be asked for the object
     slots: shared memory allocated for the matrix and the factor
     payload_bytes: size of the values if they are in no slot
+    positions: they are positions, from which the worker assembles the matrix
     """
 
     number: int
@@ -56,6 +57,7 @@ class InFlightJob:
     exclusive_until: float = 0.0
     method: str = "cholesky"
     payload_bytes: int = 0
+    positions: bool = False
 
 
 class Leases:
@@ -71,6 +73,7 @@ class Leases:
         self.by_worker: dict[str, InFlightJob] = {}
         self._expired: dict[str, list[InFlightJob]] = {}  # by worker
         self._seconds: dict[str, dict[str, float]] = {}  # duration of the last factorization, by object and worker
+        self._answered: dict[tuple[str, str], set[tuple[str, bool]]] = {}  # methods, and whether it assembled, likewise
         self._doublings: dict[tuple[str, str], int] = {}  # of the lease, after expired jobs, by object and worker
         self._reassigned: set[int] = set()  # numbers of jobs whose object another worker may have
         self._last = 0
@@ -80,10 +83,14 @@ class Leases:
         self._last += 1
         return self._last
 
-    def lease(self, object: str, worker: str) -> float:
-        """Time [s] that the worker has for its answer; doubled after each job that expired."""
+    def lease(self, object: str, worker: str, method: str = "cholesky", positions: bool = False) -> float:
+        """Time [s] that the worker has for its answer; doubled after each job that expired.
+
+        MAX_LEASE for the first job of an object by a method, and the first that it assembles itself: it may import and
+        compile for that.
+        """
         known = self._seconds.get(object, {}).get(worker)
-        if known is None:
+        if known is None or (method, positions) not in self._answered.get((object, worker), ()):
             return MAX_LEASE
         doublings = self._doublings.get((object, worker), 0)
         return float(min(MAX_LEASE, max(MIN_LEASE, LEASE_FACTOR * known) * 2**doublings))
@@ -155,6 +162,7 @@ class Leases:
         self._free_expired(job.worker, job.number)
         if seconds is not None:
             self._seconds.setdefault(job.object, {})[job.worker] = seconds
+            self._answered.setdefault((job.object, job.worker), set()).add((job.method, job.positions))
             self._doublings.pop((job.object, job.worker), None)
 
     def expire(self, now: float) -> list[InFlightJob]:
@@ -197,8 +205,9 @@ class Leases:
         """Drops what is known of an object that has a new epoch. The worker of its job stays busy until it answers."""
         self.by_object.pop(object, None)
         self._seconds.pop(object, None)
-        for pair in [pair for pair in self._doublings if pair[0] == object]:
-            del self._doublings[pair]
+        for known in (self._doublings, self._answered):
+            for pair in [pair for pair in known if pair[0] == object]:
+                del known[pair]
 
     def remove_worker(self, worker: str) -> InFlightJob | None:
         """Frees all slots of a worker that left; returns its job if that is of the present epoch of its object."""
@@ -206,8 +215,9 @@ class Leases:
             self._free_slots(old)
         for seconds in self._seconds.values():
             seconds.pop(worker, None)
-        for pair in [pair for pair in self._doublings if pair[1] == worker]:
-            del self._doublings[pair]
+        for known in (self._doublings, self._answered):
+            for pair in [pair for pair in known if pair[1] == worker]:
+                del known[pair]
         job = self.by_worker.pop(worker, None)
         if job is None:
             return None

@@ -77,9 +77,6 @@ def topology(simulation: Simulation, body: Body) -> pb.Topology:
     shape(simulation, body, simulation.parameters.scene, message)
     if body.mesh.quadratic is not None:
         message.quadratic = _bytes(body.mesh.quadratic, "<i4")
-    for name, group in body.mesh.groups.items():
-        parts = (_bytes(part, "<i4") for part in (group.elements, group.faces, group.nodes))
-        message.groups.append(pb.Group(**dict(zip(("elements", "faces", "nodes"), parts, strict=True)), name=name))
     if body.skin is not None:
         message.skin_nodes, message.skin_weights = _bytes(body.skin.nodes, "<i4"), _bytes(body.skin.weights, "<f8")
         message.skin_triangles = _bytes(body.skin.triangles, "<i4")
@@ -105,6 +102,9 @@ def shape(simulation: Simulation, body: Body, scene: Scene, message: pb.Topology
     message.fixed = _bytes(np.flatnonzero(fixed[body.nodes]), "<i4")
     if any(pose.rotate) or any(pose.translate):
         message.reference = _bytes(rest, "<f8")
+    for name, group in body.mesh.groups.items():
+        parts = (_bytes(part, "<i4") for part in (group.elements, group.faces, group.nodes))
+        message.groups.append(pb.Group(**dict(zip(("elements", "faces", "nodes"), parts, strict=True)), name=name))
 
 
 def moduli(simulation: Simulation, body: Body, message: pb.Topology) -> None:

@@ -80,11 +80,8 @@ def _split(simulation: Simulation, body: Body, wanted: pb.Cut, client: str) -> p
 
 def _positions(simulation: Simulation, body: Body) -> Float64:
     """Returns the positions of a body's nodes now, also of copies that the loop has not made yet [m]."""
-    world, cutting = simulation.world, simulation.cutting
-    x = world.backend.fetch(world.x).copy()
-    if world.splitting is not None and cutting is not None:
-        x = cutting.with_copies(simulation.parameters.scene, x)
-    return np.asarray(x[body.nodes])
+    assert simulation.cutting is not None
+    return np.asarray(simulation.cutting.positions(simulation.parameters.scene)[body.nodes])
 
 
 def _tets(simulation: Simulation, body: Body) -> Int32:
@@ -165,7 +162,8 @@ class CutTelemetry:
         }  # steps before the first with it, number, and epoch, of cuts
         self._unwritten: dict[str, deque[tuple[pb.Topology, float]]] = {
             b.name: deque(maxlen=1) for b in bodies
-        }  # the newest that the log had no room for, and from when it holds [s]; no frame of earlier ones is written
+        }  # the newest that the log had no room for, and from when it holds [s]
+        self._logged: dict[str, deque[tuple[int, int]]] = {b.name: deque([(0, 1)], maxlen=KEPT) for b in bodies}
         self._skins: dict[str, Int64] = {}  # element of each vertex
         self._announced: dict[str, int] = {}  # epochs of objects, but for the first
         self._lock = Lock()
@@ -180,6 +178,7 @@ class CutTelemetry:
             body = self._simulation.world.body(name)
             epoch = self._announced[name] = self._simulation.epoch(name, step)
             taken[0] = -1, 0, epoch
+            self._logged[name].append((0, epoch))
             removed = removed_from(scene, body)
             if len(removed):
                 self._tell(body, scene, step - 1)
@@ -200,15 +199,21 @@ class CutTelemetry:
         taken = self._taken[name]
         return next(((number, epoch) for at, number, epoch in reversed(taken) if at < step), taken[0][1:])
 
-    def written(self, name: str) -> bool:
-        """Gives the log what it had no room for of an object; returns True if it has all of its meshes now."""
-        waiting = self._unwritten.get(name)
+    def written(self, name: str, step: int) -> bool:
+        """Gives the log what it had no room for of an object; returns True if it has the mesh of a step's frame."""
+        if name not in self._logged:
+            return True
+        self._write(name)
+        return self.number(name, step) in self._logged[name]
+
+    def _write(self, name: str) -> None:
+        waiting = self._unwritten[name]
         while waiting and self._recorder is not None:
             message, time = waiting[0]
             if not self._recorder.topology(message, block=self._patient, time=time, again=True):
-                return False
+                return
+            self._logged[name].append((message.cut, message.header.epoch))
             waiting.popleft()
-        return True
 
     def take(self) -> None:
         """Tells of the cuts that the loop has taken up since the last call, before frames are sent."""
@@ -249,7 +254,7 @@ class CutTelemetry:
             change(message)
             time = max(step, 0) * self._simulation.world.dt
             self._unwritten[body.name].append((message, time))
-            self.written(body.name)
+            self._write(body.name)
 
     def _splits(self, body: Body) -> bool:
         splitting = self._simulation.world.splitting

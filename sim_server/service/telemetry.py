@@ -279,7 +279,7 @@ class Telemetry:
     def _record_frame(self, step: int, x: Float64, v: Float64, poses: Float64 | None = None) -> None:
         assert self.recorder is not None
         for body in self.simulation.world.bodies:
-            if self.cuts.written(body.name):
+            if self.cuts.written(body.name, step):
                 self.recorder.state(self._state(body, step, x, v), block=self.patient)
             else:
                 self.recorder.skip_frame()

@@ -367,3 +367,44 @@ def components(tets, nodes):
     pairs = np.concatenate([tets[:, [0, k]] for k in (1, 2, 3)])
     graph = coo_array((np.ones(len(pairs)), pairs.T), shape=(nodes, nodes))
     return len(np.unique(connected_components(graph, directed=False)[1][np.unique(tets)]))
+
+
+def test_a_thousand_cuts_are_as_many_at_the_start():
+    splitter = Splitter("bar", bar((4, 2, 2), (2, 0.5, 0.5)), 60)
+    faces = np.flatnonzero(splitter.whole.closed)[:3]
+    sides = [int(splitter.faces.sides[face, 0]) for face in faces]
+    once = splitter.split("; ".join(map(str, sides)))
+    again = splitter.split("; ".join(map(str, sides * 400)))
+    np.testing.assert_array_equal(once.tets, again.tets)
+
+
+def test_copies_of_nodes_that_a_group_fixes_are_fixed_from_the_start():
+    mesh = bar((4, 2, 2), (2, 0.5, 0.5))
+    left = np.flatnonzero(mesh.rest[:, 0] < 0.01)
+    arrays = {"points": mesh.rest, "tets": mesh.tets, "groups": {"left": {"nodes": left}}}
+    live = made(own=SPARE | {"fixed": {"group": "left"}}, mesh=arrays)
+    found = split(live, "Y > 0.25")
+    opened = live.parameters.scene.objects[0].effects["cutting"].opened
+    begun = made(own={"cutting": {"spare": 60, "opened": opened}, "fixed": {"group": "left"}}, mesh=arrays)
+    fixed = (found.origin >= 0) & np.isin(found.root, left)
+    assert fixed.sum() > len(left) and not begun.world.free[fixed].any()
+    for each in (live, begun):
+        each.engine.run(10)
+    np.testing.assert_allclose(live.fetch().x, begun.fetch().x, atol=1e-9)
+
+
+def test_a_cut_sees_copies_where_they_come_from_until_a_step_has_made_them():
+    sim = made(own=SPARE)
+    sim.engine.run(3)
+    found = split(sim, HALVES)
+    copies = np.flatnonzero(found.used > np.arange(len(found.origin)) - splitter_of(sim).nodes)
+    x = sim.cutting.positions(sim.parameters.scene)
+    np.testing.assert_array_equal(x[copies], x[found.root[copies]])
+    sim.engine.run(3)
+    np.testing.assert_array_equal(sim.cutting.positions(sim.parameters.scene), sim.fetch().x)
+
+
+def test_workers_get_matrices_of_bodies_that_may_be_split():
+    sim = made(own=SPARE)
+    assert not all(effect.known_to_workers for effect in sim.effects.values())
+    assert all(effect.known_to_workers for effect in made(own={"cutting": True}).effects.values())

@@ -124,6 +124,15 @@ def test_leases_follow_the_last_factorization_and_double_when_missed(leases: Lea
     assert leases.lease("beam", "w") == MIN_LEASE
 
 
+def test_the_first_job_that_a_worker_assembles_may_take_its_time(leases: Leases) -> None:
+    """It imports and compiles for that, though it has made factors of matrices; so may one by another method."""
+    leases.finish(sent(leases), 0.01)
+    assert leases.lease("beam", "w") == MIN_LEASE
+    assert leases.lease("beam", "w", positions=True) == leases.lease("beam", "w", "incomplete") == MAX_LEASE
+    leases.finish(replace(sent(leases), positions=True), 0.01)
+    assert leases.lease("beam", "w", positions=True) == MIN_LEASE
+
+
 def test_who_is_late_costs_others_no_time(leases: Leases) -> None:
     """Leases are of an object at a worker."""
     leases.finish(sent(leases, worker="good"), 0.4)

@@ -2,6 +2,7 @@
 """Sessions: they end, they listen only where told, they never block, and they know when not to share memory."""
 
 import os
+import resource
 import subprocess
 import sys
 from pathlib import Path
@@ -181,15 +182,15 @@ def test_too_little_lockable_memory_loses_nothing() -> None:
 
 
 def test_the_limit_counts_only_without_the_capability(monkeypatch: pytest.MonkeyPatch) -> None:
-    limits = {shm_limits.resource.RLIMIT_MEMLOCK: 8 << 20}
-    unlimited = shm_limits.resource.RLIM_INFINITY
-    monkeypatch.setattr(shm_limits.resource, "getrlimit", lambda which: (limits.get(which, unlimited),) * 2)
+    limits = {resource.RLIMIT_MEMLOCK: 8 << 20}
+    unlimited = resource.RLIM_INFINITY
+    monkeypatch.setattr(resource, "getrlimit", lambda which: (limits.get(which, unlimited),) * 2)
     monkeypatch.setattr(shm_limits, "may_lock_anything", lambda: False)
     assert "locked-memory limit is 8192 KiB" in shm_limits.obstacle()
     assert shm_limits.obstacle() and not open_and_close(free_endpoint())
     monkeypatch.setattr(shm_limits, "may_lock_anything", lambda: True)
     assert shm_limits.obstacle() == ""
-    limits[shm_limits.resource.RLIMIT_FSIZE] = 8 << 20
+    limits[resource.RLIMIT_FSIZE] = 8 << 20
     assert "files may have 8192 KiB" in shm_limits.obstacle()
     monkeypatch.setattr(shm_limits, "SHM", Path("/nowhere"))
     assert "is not writable" in shm_limits.obstacle()
