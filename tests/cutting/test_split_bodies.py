@@ -9,6 +9,7 @@ from sim_server.checkpoint.content import capture, restore, restore_driver, save
 from sim_server.checkpoint.file import from_bytes
 from sim_server.errors import InputError
 from sim_server.mechanics.cut_shapes import border, opened_by_blade
+from sim_server.mechanics.named_points import NamedPoints
 from sim_server.mechanics.splitting import Splitter, opening
 from sim_server.mesh import Mesh, bar
 from sim_server.mesh.surface import surface_triangles
@@ -19,7 +20,7 @@ from sim_server.service.cuts import BadCut, carry_out
 from sim_server.simulation import Simulation
 from sim_server.state.start import Start
 from sim_server.updates.driver import Driver
-from tests.cutting.cut_scenes import LAWS, made, table
+from tests.cutting.cut_scenes import BAR, LAWS, made, table
 
 SPLIT_LAWS = [law for law in LAWS if law != "mass_spring"]
 SLIT, HALVES = "X > 1 and Y > 0.25", "X > 1"
@@ -367,3 +368,59 @@ def components(tets, nodes):
     pairs = np.concatenate([tets[:, [0, k]] for k in (1, 2, 3)])
     graph = coo_array((np.ones(len(pairs)), pairs.T), shape=(nodes, nodes))
     return len(np.unique(connected_components(graph, directed=False)[1][np.unique(tets)]))
+
+
+def places(sim):
+    found = NamedPoints(sim.world, sim.world.bodies[0])
+    found.now()
+    return found
+
+
+def test_box_and_tip_are_those_of_a_body_without_spare_nodes():
+    """Spare nodes wait where the first node is at rest: among what is fixed, or high above a body that fell."""
+    fixed = {"fixed": {"where": "X > 1.99"}}
+    sim, plain = made(own=SPARE | fixed), made(own=fixed)
+    assert places(sim).tip() == places(plain).tip() and places(sim).tip()[0] == 0
+    sim, plain = (made(fixed=False, own=own | {"rayleigh": {}}) for own in (SPARE, {}))
+    for each in (sim, plain):
+        each.engine.run(30)
+    assert np.ptp(sim.fetch().x[:, 1]) > 1
+    np.testing.assert_allclose(places(sim).box(), places(plain).box(), atol=1e-9)
+    assert places(sim).tip() == pytest.approx(places(plain).tip(), abs=1e-9)
+
+
+def test_copies_of_fixed_nodes_are_fixed_and_those_that_move_are_in_the_box():
+    own = SPARE | {"fixed": {"where": "X < 0.01 and Y < 0.3"}}
+    sim = made(own=own)
+    before = places(sim)
+    found = split(sim, "Y > 0.25")
+    sim.engine.run(20)
+    copies = np.flatnonzero((found.origin >= 0) & (found.origin != np.arange(len(found.origin))))
+    of_fixed = sim.world.bodies[0].mesh.rest[found.root[copies], 0] < 0.01
+    before.now()
+    for points in (before, places(sim)):
+        assert of_fixed.any() and np.array_equal(points.free[copies], ~of_fixed)
+        x = sim.fetch().x[found.origin >= 0]
+        assert points.box() == (tuple(x.min(axis=0)), tuple(x.max(axis=0)))
+        assert points.tip() == before.tip()
+
+
+def test_copies_for_workers_have_the_room_of_their_body():
+    """A small body that may not be split, one that may, and one that would need as much as it has elements."""
+
+    def bodies(spares):
+        first = table()["object"][0]
+        for name, spare, mesh in zip("abc", spares, (FINE, BAR, BAR), strict=True):
+            yield first | {"name": name, "mesh": mesh, "effects": first["effects"] | {"cutting": {"spare": spare}}}
+
+    plain, sim = (made(object=list(bodies(spares))) for spares in ((0, 0, 0), (0, 10, 10**4)))
+    blocks = [len(plain.system.body_values(b.first, b.last)) for b in plain.world.bodies]
+    rooms = [sim.system.most_blocks(b.first, b.last) for b in sim.world.bodies]
+    most = [2 * 6 * len(b.mesh.tets) + b.last - b.first for b in sim.world.bodies]
+    assert rooms[0] == blocks[0]
+    assert blocks[1] < rooms[1] <= most[1] and rooms[2] == most[2]
+    apart = sim.world.splitting.splitters[2]
+    sim.parameters.set(opening(apart, "", np.flatnonzero(apart.whole.closed)))
+    sim.engine.run(2)
+    used = [len(sim.system.body_values(b.first, b.last)) for b in sim.world.bodies]
+    assert used[:2] == [blocks[0], blocks[1] + 10] and blocks[2] < used[2] - 10**4 <= rooms[2] - 10**4
