@@ -8,6 +8,7 @@ from protocol import messages_pb2 as pb
 from sim_server.checkpoint.content import capture, restore, restore_driver, saved_factors
 from sim_server.checkpoint.file import from_bytes
 from sim_server.errors import InputError
+from sim_server.mechanics import shape_matching
 from sim_server.mechanics.cut_shapes import border, opened_by_blade
 from sim_server.mechanics.named_points import NamedPoints
 from sim_server.mechanics.splitting import Splitter, opening
@@ -424,3 +425,20 @@ def test_copies_for_workers_have_the_room_of_their_body():
     sim.engine.run(2)
     used = [len(sim.system.body_values(b.first, b.last)) for b in sim.world.bodies]
     assert used[:2] == [blocks[0], blocks[1] + 10] and blocks[2] < used[2] - 10**4 <= rooms[2] - 10**4
+
+
+def test_what_is_removed_changes_arms_of_frames_but_not_neighbours(monkeypatch):
+    """Those of a split body that begins without these elements."""
+    sim = made("neo_hookean", own=SPARE)
+    split(sim, SLIT)
+    text, gone = sim.parameters.scene.objects[0].effects["cutting"].opened, "0-40 150"
+    sim.engine.take_changes()
+    whole = sim.shape.arm.copy()
+    begins = made("neo_hookean", own={"cutting": {"spare": 60, "opened": text, "removed": gone}})
+    monkeypatch.delattr(shape_matching, "neighbours")  # those that it has stay
+    sim.parameters.set({"object.bar.effects.cutting.removed": f'"{gone}"'})
+    sim.engine.take_changes()
+    assert np.array_equal(sim.shape.arm, begins.shape.arm) and not np.array_equal(sim.shape.arm, whole)
+    assert np.array_equal(sim.shape.neighbour, begins.shape.neighbour)
+    with pytest.raises(NameError):
+        split(sim, HALVES)
