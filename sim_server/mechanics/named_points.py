@@ -4,6 +4,9 @@
 tip: the free node farthest from the fixed ones (from the middle of the object if nothing is fixed) in the shape at
 rest, so that it is the same node throughout. right, left, top, bottom, front, back: the free node that is now farthest
 along +x, -x, +y, -y, +z, -z.
+
+In scenes with bodies that may be split, box and tip leave out nodes without elements: spare nodes that wait, and those
+that lost all of theirs.
 """
 
 from collections.abc import Sequence
@@ -29,16 +32,22 @@ class NamedPoints:
         self.body = body
         self._world = world
         self._x: Float64 = np.zeros((0, 3))
+        self._boxed: slice | NDArray[np.bool_] = slice(None)  # nodes in the box
         self._moves = (world.free[body.nodes] > 0) | self._without_elements()
         self.size = float(np.linalg.norm(np.ptp(body.mesh.rest, axis=0)))  # m, diagonal of the box at rest
 
     @property
     def free(self) -> NDArray[np.bool_]:
         """Which of its nodes move now, (nodes,)."""
-        return self._moves & ~self._without_elements()
+        w = self._world
+        live = w.splitting is not None  # copies move if what they are copies of does
+        moves = w.backend.fetch(w.free)[self.body.nodes] > 0 if live else self._moves
+        return moves & ~self._without_elements()
 
     def now(self, x: Float64 | None = None) -> Float64:
         """Copies and returns positions of its nodes [m], (nodes, 3). x: of all nodes of the scene; None: fetch them."""
+        if self._world.splitting is not None:
+            self._boxed = self._with_elements()  # before the positions, which a copy gets before it has elements
         fetched = self._world.backend.fetch(self._world.x) if x is None else x
         self._x = fetched[self.body.nodes].copy()
         return self._x
@@ -50,9 +59,15 @@ class NamedPoints:
             return np.zeros(self.body.last - self.body.first, bool)
         return np.asarray(w.backend.fetch(w.without_elements)[nodes] > 0)
 
+    def _with_elements(self) -> NDArray[np.bool_]:
+        """Returns which of its nodes have elements; all in scenes without splitting, and if none has any."""
+        without = self._without_elements()
+        return np.ones_like(without) if self._world.splitting is None or without.all() else ~without
+
     def box(self) -> tuple[Point, Point]:
         """Returns the lowest and highest coordinates [m]."""
-        return _point(self._x.min(axis=0)), _point(self._x.max(axis=0))
+        x = self._x[self._boxed]
+        return _point(x.min(axis=0)), _point(x.max(axis=0))
 
     def where(self) -> str:
         """Returns the box in words."""
@@ -81,15 +96,25 @@ class NamedPoints:
 
     @cached_property
     def _tip(self) -> int:
-        """Number of the tip among the nodes of the body."""
-        rest, free = self.body.mesh.rest, self.free
-        if free.all():
-            distance = np.linalg.norm(rest - rest.mean(axis=0), axis=1)
-        else:
+        """Number of the tip among the nodes of the body; no copy, whose place at rest is that of another node."""
+        n = self._nodes_of_mesh
+        rest, free, there = self.body.mesh.rest[:n], self.free[:n], self._with_elements()[:n]
+        fixed = there & ~free
+        if fixed.any():
             from scipy.spatial import cKDTree
 
-            distance, _ = cKDTree(rest[~free]).query(rest)
+            distance, _ = cKDTree(rest[fixed]).query(rest)
+        else:
+            distance = np.linalg.norm(rest - rest[there].mean(axis=0), axis=1)
         return int(np.where(free, distance, -np.inf).argmax())
+
+    @property
+    def _nodes_of_mesh(self) -> int:
+        """Number of its nodes without spare ones, which are behind them."""
+        splitting, index = self._world.splitting, self.body.index
+        if splitting is None or index not in splitting.splitters:
+            return self.body.last - self.body.first
+        return splitting.splitters[index].nodes
 
 
 def shown(point: Sequence[float] | Float64) -> str:

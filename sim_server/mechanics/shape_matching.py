@@ -41,31 +41,51 @@ class ShapeMatching:
             self.start, self.neighbour, self.arm = world.at_start(self._of)
             return
         most = self._room(splitting)
-        self._last: tuple[Scene, tuple[Int32, Int32, Float64]] | None = None
+        self._last: tuple[list[str], tuple[Int32, Int32]] | None = None  # by the faces that are open
+        self._last_arm: tuple[list[str], Float64] | None = None  # by these and the elements that were removed
         self.start, self.neighbour, self.arm = (
             world.follow("cutting", compute=partial(self._followed, part, most)) for part in range(3)
         )
 
     def _of(self, scene: Scene) -> tuple[Int32, Int32, Float64]:
         """Returns start, neighbour and arm by the parameters of a scene."""
-        w, splitting, mass, rest = self.world, self.world.splitting, self.world.uncut_mass, self.world.rest
+        start, neighbour = self._neighbours(scene)
+        return start, neighbour, self._arm(scene, start, neighbour)
+
+    def _neighbours(self, scene: Scene) -> tuple[Int32, Int32]:
+        splitting = self.world.splitting
         tets = [body.tets if splitting is None else splitting.tets(scene, body) for body in self._bodies]
-        if splitting is not None:
-            root = splitting.nodes(scene, "root")
+        return neighbours(np.concatenate(tets), self.world.nodes, self._level)
+
+    def _arm(self, scene: Scene, start: Int32, neighbour: Int32) -> Float64:
+        w, mass, rest = self.world, self.world.uncut_mass, self.world.rest
+        if w.splitting is not None:
+            root = w.splitting.nodes(scene, "root")
             mass, rest = masses_left(present_nodes(scene, w), whole_masses(scene, w, mass)), rest[root]
-        start, neighbour = neighbours(np.concatenate(tets), w.nodes, self._level)
-        return start, neighbour, _arms(rest, mass, start, neighbour)
+        return _arms(rest, mass, start, neighbour)
 
     def _followed(self, part: int, most: int, scene: Scene) -> NDArray[Any]:
-        """Returns one of these three arrays with room for `most` neighbours."""
-        if self._last is None or self._last[0] is not scene:
-            self._last = scene, self._of(scene)
-        found = self._last[1][part]
+        """Returns one of these three arrays with room for `most` neighbours.
+
+        Neighbours are found again where other faces are open, but not where elements were removed, which arms tell.
+        """
+        opened, removed = self._texts(scene, "opened"), self._texts(scene, "removed")
+        if self._last is None or self._last[0] != opened:
+            self._last = opened, self._neighbours(scene)
+        start, neighbour = self._last[1]
         if part == 0:
-            return found.copy()
-        if len(found) > most:
-            raise InputError(f"the frames of nodes need room for {len(found)} neighbours, {most} is what there is")
-        return np.concatenate([found, np.zeros((most - len(found), *found.shape[1:]), found.dtype)])
+            return start.copy()
+        if len(neighbour) > most:
+            raise InputError(f"the frames of nodes need room for {len(neighbour)} neighbours, {most} is what there is")
+        if part == 1:
+            return np.concatenate([neighbour, np.zeros(most - len(neighbour), neighbour.dtype)])
+        if self._last_arm is None or self._last_arm[0] != [*opened, *removed]:
+            self._last_arm = [*opened, *removed], self._arm(scene, start, neighbour)
+        return np.concatenate([self._last_arm[1], np.zeros((most - len(neighbour), 3))])
+
+    def _texts(self, scene: Scene, key: str) -> list[str]:
+        """Returns what a parameter of cutting says of each body, nothing of those that are not cut."""
+        return [getattr(scene.objects[b.index].effects.get("cutting"), key, "") for b in self._bodies]
 
     def _room(self, splitting: Splitting) -> int:
         """Returns how many neighbours there is room for: those in the whole meshes, and for each spare node twice as

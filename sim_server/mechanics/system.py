@@ -82,6 +82,7 @@ class System:
             blocks, most = len(keys), len(self.columns)
         else:  # which has no holders beside it
             self.followed = FollowedPattern(world, elements, self.row)
+            self._most = _most_above(world, elements, self.row, self.column, self.followed.blocks)
             arrays, self.stencils = self.followed.follow()
             self._take(arrays)
             blocks, most = self.followed.blocks, self.followed.places + 1
@@ -186,11 +187,36 @@ class System:
         """Returns the blocks that a body has at most, however it is split."""
         if self.followed is None:
             return int(self.row_start[last] - self.row_start[first])
-        return last - first + 2 * self.followed.blocks
+        return last - first + 2 * self._most[first]
 
     def body_values(self, first: int, last: int) -> Float64:
         """Returns a view of the blocks of one body, (blocks, 3, 3)."""
         return self.values[self.row_start[first] : self.row_start[last]]
+
+
+def _most_above(world: World, elements: Sequence[Coupled], row: Int32, column: Int32, room: int) -> dict[int, int]:
+    """Returns how many blocks above the diagonal each body can have, by its first node.
+
+    row, column: of the blocks at the start; room: for those of all bodies. Bodies that are not split keep theirs.
+    Others have at most what is left if the others are whole, and no more than their elements couple.
+    """
+    n, splitting = world.nodes, world.splitting
+    assert splitting is not None
+    root = world.at_start(lambda scene: splitting.nodes(scene, "root"))
+    ends = np.sort([root[row], root[column]], axis=0).astype(np.int64)
+    whole = np.unique(ends[0] * n + ends[1]) // n  # rows of the blocks if no body is split
+    most = {body.first: int(((body.first <= whole) & (whole < body.last)).sum()) for body in world.bodies}
+    for index in splitting.splitters:
+        body = world.bodies[index]
+        coupled = 0
+        for each in elements:
+            if not isinstance(each, np.ndarray):  # patches couple what no list of elements tells
+                coupled += room
+            elif each.size:
+                own = (body.first <= each[:, 0]) & (each[:, 0] < body.last)
+                coupled += int(own.sum()) * (each.shape[1] * (each.shape[1] - 1) // 2)
+        most[body.first] = min(most[body.first] + room - len(whole), coupled)
+    return most
 
 
 def _couplings(elements: Int32, world: World, n: int, free: Float64) -> tuple[Int64, Int32]:

@@ -8,7 +8,9 @@ from protocol import messages_pb2 as pb
 from sim_server.checkpoint.content import capture, restore, restore_driver, saved_factors
 from sim_server.checkpoint.file import from_bytes
 from sim_server.errors import InputError
+from sim_server.mechanics import shape_matching
 from sim_server.mechanics.cut_shapes import border, opened_by_blade
+from sim_server.mechanics.named_points import NamedPoints
 from sim_server.mechanics.splitting import Splitter, opening
 from sim_server.mesh import Mesh, bar
 from sim_server.mesh.surface import surface_triangles
@@ -19,7 +21,7 @@ from sim_server.service.cuts import BadCut, carry_out
 from sim_server.simulation import Simulation
 from sim_server.state.start import Start
 from sim_server.updates.driver import Driver
-from tests.cutting.cut_scenes import LAWS, made, table
+from tests.cutting.cut_scenes import BAR, LAWS, made, table
 
 SPLIT_LAWS = [law for law in LAWS if law != "mass_spring"]
 SLIT, HALVES = "X > 1 and Y > 0.25", "X > 1"
@@ -408,3 +410,76 @@ def test_workers_get_matrices_of_bodies_that_may_be_split():
     sim = made(own=SPARE)
     assert not all(effect.known_to_workers for effect in sim.effects.values())
     assert all(effect.known_to_workers for effect in made(own={"cutting": True}).effects.values())
+
+
+def places(sim):
+    found = NamedPoints(sim.world, sim.world.bodies[0])
+    found.now()
+    return found
+
+
+def test_box_and_tip_are_those_of_a_body_without_spare_nodes():
+    """Spare nodes wait where the first node is at rest: among what is fixed, or high above a body that fell."""
+    fixed = {"fixed": {"where": "X > 1.99"}}
+    sim, plain = made(own=SPARE | fixed), made(own=fixed)
+    assert places(sim).tip() == places(plain).tip() and places(sim).tip()[0] == 0
+    sim, plain = (made(fixed=False, own=own | {"rayleigh": {}}) for own in (SPARE, {}))
+    for each in (sim, plain):
+        each.engine.run(30)
+    assert np.ptp(sim.fetch().x[:, 1]) > 1
+    np.testing.assert_allclose(places(sim).box(), places(plain).box(), atol=1e-9)
+    assert places(sim).tip() == pytest.approx(places(plain).tip(), abs=1e-9)
+
+
+def test_copies_of_fixed_nodes_are_fixed_and_those_that_move_are_in_the_box():
+    own = SPARE | {"fixed": {"where": "X < 0.01 and Y < 0.3"}}
+    sim = made(own=own)
+    before = places(sim)
+    found = split(sim, "Y > 0.25")
+    sim.engine.run(20)
+    copies = np.flatnonzero((found.origin >= 0) & (found.origin != np.arange(len(found.origin))))
+    of_fixed = sim.world.bodies[0].mesh.rest[found.root[copies], 0] < 0.01
+    before.now()
+    for points in (before, places(sim)):
+        assert of_fixed.any() and np.array_equal(points.free[copies], ~of_fixed)
+        x = sim.fetch().x[found.origin >= 0]
+        assert points.box() == (tuple(x.min(axis=0)), tuple(x.max(axis=0)))
+        assert points.tip() == before.tip()
+
+
+def test_copies_for_workers_have_the_room_of_their_body():
+    """A small body that may not be split, one that may, and one that would need as much as it has elements."""
+
+    def bodies(spares):
+        first = table()["object"][0]
+        for name, spare, mesh in zip("abc", spares, (FINE, BAR, BAR), strict=True):
+            yield first | {"name": name, "mesh": mesh, "effects": first["effects"] | {"cutting": {"spare": spare}}}
+
+    plain, sim = (made(object=list(bodies(spares))) for spares in ((0, 0, 0), (0, 10, 10**4)))
+    blocks = [len(plain.system.body_values(b.first, b.last)) for b in plain.world.bodies]
+    rooms = [sim.system.most_blocks(b.first, b.last) for b in sim.world.bodies]
+    most = [2 * 6 * len(b.mesh.tets) + b.last - b.first for b in sim.world.bodies]
+    assert rooms[0] == blocks[0]
+    assert blocks[1] < rooms[1] <= most[1] and rooms[2] == most[2]
+    apart = sim.world.splitting.splitters[2]
+    sim.parameters.set(opening(apart, "", np.flatnonzero(apart.whole.closed)))
+    sim.engine.run(2)
+    used = [len(sim.system.body_values(b.first, b.last)) for b in sim.world.bodies]
+    assert used[:2] == [blocks[0], blocks[1] + 10] and blocks[2] < used[2] - 10**4 <= rooms[2] - 10**4
+
+
+def test_what_is_removed_changes_arms_of_frames_but_not_neighbours(monkeypatch):
+    """Those of a split body that begins without these elements."""
+    sim = made("neo_hookean", own=SPARE)
+    split(sim, SLIT)
+    text, gone = sim.parameters.scene.objects[0].effects["cutting"].opened, "0-40 150"
+    sim.engine.take_changes()
+    whole = sim.shape.arm.copy()
+    begins = made("neo_hookean", own={"cutting": {"spare": 60, "opened": text, "removed": gone}})
+    monkeypatch.delattr(shape_matching, "neighbours")  # those that it has stay
+    sim.parameters.set({"object.bar.effects.cutting.removed": f'"{gone}"'})
+    sim.engine.take_changes()
+    assert np.array_equal(sim.shape.arm, begins.shape.arm) and not np.array_equal(sim.shape.arm, whole)
+    assert np.array_equal(sim.shape.neighbour, begins.shape.neighbour)
+    with pytest.raises(NameError):
+        split(sim, HALVES)
