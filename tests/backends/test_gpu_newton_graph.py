@@ -69,14 +69,14 @@ def name(launch: tuple[Any, ...]) -> str:
 
 def comparable(launches: list[tuple[Any, ...]]) -> list[tuple[Any, ...]]:
     """With addresses and other large numbers in the order of their first appearance, since those of two scenes
-    differ."""
+    differ. Addresses may be below 2^32, as those of the heap of Debian's Python are."""
     known: dict[int, int] = {}
 
     def numbers(argument: np.ndarray) -> list[Any]:
         if argument.dtype.names:  # and not what lies between its members
             return [x for name in argument.dtype.names for x in numbers(argument[name])]
         found = argument.view(np.uint64) if argument.itemsize == 8 else argument
-        return [known.setdefault(x, len(known)) if x >> 32 else x for x in found.ravel().tolist()]
+        return [known.setdefault(x, len(known)) if x >> 20 else x for x in found.ravel().tolist()]
 
     return [(*launch[:4], [numbers(argument) for argument in launch[4]]) for launch in launches]
 

@@ -79,7 +79,7 @@ def test_a_mesh_of_arrays_is_the_same_as_one_of_a_scene_file():
         with wf.Simulation(falling(mesh, fixed={"where": "Z < 0.01"})) as made:
             made.step(5)
             stepped.append(made.x)
-    np.testing.assert_array_equal(*stepped)
+    np.testing.assert_allclose(*stepped, atol=1e-7)  # as exact as the solves, whose kind is chosen by times
 
 
 def test_a_parameter_is_set_between_steps(simulation):
