@@ -12,7 +12,7 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 
-from tests.bench.hard_cases.running import Runs, of_precision
+from tests.bench.hard_cases.running import STARTS, Runs, of_precision
 from tests.bench.harness.report import Report, plots
 from tests.hard_cases.case import Case
 from tests.hard_cases.effect_table import EFFECT_CASES
@@ -20,7 +20,6 @@ from tests.hard_cases.long_runs import LONG_RUNS
 from tests.hard_cases.models import MODEL_CASES, MODELS, QUICK, SITUATIONS
 from tests.hard_cases.of_effects import SEEDS, EffectCase, EffectOutcome
 from tests.hard_cases.running import Outcome, broken, unexpected
-from tests.hard_cases.seeds import SEEDED, SPLITS, tally
 from tests.hard_cases.table import CASES
 
 ABOUT = """\
@@ -126,16 +125,10 @@ def notes(cases: Sequence[Case | EffectCase]) -> str:
     return "\n".join(f"- *{', '.join(names)}*: {note}" for note, names in about.items())
 
 
-def random_starts(quick: bool) -> list[dict[str, Any]]:
+def random_starts(runs: Runs, quick: bool) -> list[dict[str, Any]]:
     """A row for each law and split of the cells."""
-    seeds = range(1 if quick else 16)
-    rows = []
-    with np.errstate(all="ignore"):
-        for name in list(SEEDED)[3:4] if quick else SEEDED:
-            for split in SPLITS:
-                rows.append({"law": name, "split": split, **tally(name, split, seeds)})
-                print(rows[-1], flush=True)
-    return rows
+    wanted = STARTS[6:8] if quick else STARTS
+    return [row for _, row in runs.all([("starts", STARTS.index(start), 1 if quick else 16, "") for start in wanted])]
 
 
 def picture(results: list[tuple[Case, Outcome]]) -> Any:
@@ -289,7 +282,7 @@ def main(
     of_models, rises = measured(models, runs)
     model_rows = [model_row(case, outcome, rise) for (case, outcome), rise in zip(of_models, rises, strict=True)]
     tell_models(report, of_models, model_rows, models)
-    seeded = random_starts(quick)
+    seeded = random_starts(runs, quick)
     report.say(SEEDS_ABOUT.format(seeds=1 if quick else 16))
     report.table(seeded)
     report.data["rows"], report.data["models"], report.data["seeds"] = rows, model_rows, seeded

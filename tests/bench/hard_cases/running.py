@@ -8,6 +8,7 @@ from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures import wait as wait_for
 from dataclasses import replace
 from functools import partial
+from itertools import product
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
@@ -20,9 +21,11 @@ from tests.hard_cases.long_runs import LONG_RUNS, run_long
 from tests.hard_cases.models import MODEL_CASES, QUICK
 from tests.hard_cases.of_effects import run_effect_case
 from tests.hard_cases.running import finer, run_case
+from tests.hard_cases.seeds import SEEDED, SPLITS, tally
 from tests.hard_cases.table import CASES
 
-Job = tuple[str, int, int, str]  # kind, number in its table, seed, precision
+Job = tuple[str, int, int, str]  # kind, number in its table, seed (of starts: how many), precision
+STARTS = list(product(SEEDED, SPLITS))
 TABLES: dict[str, list[Case]] = {"case": CASES, "model": QUICK, "of models": MODEL_CASES}
 
 
@@ -48,6 +51,9 @@ def made(device: str, job: Job) -> Any:
         with tempfile.TemporaryDirectory() as folder, np.errstate(all="ignore"):
             if kind == "effect":
                 return run_effect_case(EFFECT_CASES[index], seed, device, precision)
+            if kind == "starts":
+                name, split = STARTS[index]
+                return {"law": name, "split": split, **tally(name, split, range(seed))}
             if kind == "long":
                 return run_long(LONG_RUNS[index], 1000 if seed else LONG_RUNS[index].steps)
             case = of_precision(TABLES[kind][index], precision)
