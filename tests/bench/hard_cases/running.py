@@ -84,7 +84,7 @@ class Runs:
 
     def of_cases(self, cases: list[Case], finer_too: Callable[[Case], bool]) -> Iterator[tuple[tuple[int, bool], Any]]:
         """The outcome of each case by its number and whether it was made with a tenth of the time step."""
-        kind = next(name for name, table in TABLES.items() if cases[0] in table)
+        kind = next(name for name, table in TABLES.items() if all(case in table for case in cases))
         jobs: list[Job] = []
         for case in cases:
             number = TABLES[kind].index(case)
