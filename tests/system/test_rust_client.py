@@ -70,8 +70,8 @@ def test_a_client_in_rust_feels_the_spring_of_its_grab(stage: Stage, tmp_path: P
         felt = np.array([list(map(float, found)) for found in FELT.findall(done.stdout)])
         steps, force, point = felt[:, 0], felt[:, 1:4], felt[:, 4:7]
         assert len(steps) > 20 and (np.diff(steps) > 0).all()
-        # Without gravity the force stays below its bound. The hand feels k (point - target): the target was on its way, and
-        # never went back.
+        # Without gravity the force stays below its bound. The hand feels k (point - target): the target was on its
+        # way, and never went back.
         way = point - force / STIFFNESS - start
         by = np.array([0.05, 0.1, 0])
         along = way @ by / (by @ by)
