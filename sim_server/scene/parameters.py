@@ -114,6 +114,13 @@ def as_tuple(value: Any) -> Any:
     return tuple(value) if isinstance(value, list) else value
 
 
+class OfGroup(Parameters):
+    """Elements or nodes of a group of the mesh, of which an expression may choose some."""
+
+    group: str
+    where: str | None = None
+
+
 def _of_a_group(value: Any) -> Any:
     """Returns the expression of { group = "NAME" }, which may have `where` beside it; other values as they are."""
     if not isinstance(value, dict) or not {"group"} <= value.keys() <= {"group", "where"}:
@@ -157,5 +164,7 @@ NotNegative = Annotated[float, Field(ge=0)]
 Sizes = Annotated[tuple[Positive, Positive, Positive], BeforeValidator(as_tuple)]
 Count = Annotated[int, Field(ge=1, le=1_000_000)]
 Counts = Annotated[tuple[Count, Count, Count], BeforeValidator(as_tuple)]
-Where = Annotated[str, BeforeValidator(_of_a_group), AfterValidator(_readable_expression)]
+Where = Annotated[
+    str, BeforeValidator(_of_a_group, json_schema_input_type=str | OfGroup), AfterValidator(_readable_expression)
+]
 File = Annotated[str, AfterValidator(_found)]

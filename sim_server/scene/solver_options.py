@@ -15,6 +15,7 @@ Preconditioner = Literal[
 ]
 PRECONDITIONERS: tuple[str, ...] = get_args(Preconditioner)
 FACTORS = ("cholesky", "incomplete_cholesky", "ssor_factor")  # made by workers, from an older matrix
+UpdateText = Annotated[str, Field(pattern=r"^(never|async|adaptive|(every|lockstep)-[1-9][0-9]{0,5})$")]
 CPU_ONLY = ("ssor", "ssor_factor", "incomplete_cholesky")  # sweeps and sparse solves are sequential
 
 
@@ -77,9 +78,9 @@ class SolverOptions(Parameters):
     max_iterations: int = Field(
         default=500, ge=1, le=1_000_000, description="of a solve; then the step goes on with what it has"
     )
-    preconditioner: Annotated[Preconditioner, PlainValidator(_preconditioner)] = Field(
-        default="auto", description="of the conjugate gradients; auto: chosen by measurement"
-    )
+    preconditioner: Annotated[
+        Preconditioner, PlainValidator(_preconditioner, json_schema_input_type=Preconditioner)
+    ] = Field(default="auto", description="of the conjugate gradients; auto: chosen by measurement")
     omega: float = Field(default=1.0, gt=0, lt=2, description="relaxation of ssor and ssor_factor")
     drop_tolerance: float = Field(
         default=0.003, ge=0, lt=1, description="incomplete_cholesky drops blocks of L below this times a row's norm"
@@ -94,7 +95,7 @@ class SolverOptions(Parameters):
     projection: Literal["auto", "excess", "clamp", "absolute", "none"] = Field(
         default="auto", description="treatment of negative eigenvalues of the stiffness of an element"
     )
-    update: Annotated[Update, PlainValidator(_update), PlainSerializer(str)] = Field(
+    update: Annotated[Update, PlainValidator(_update, json_schema_input_type=UpdateText), PlainSerializer(str)] = Field(
         default=Update("async"), description="when factors are made: never, every-N, async, adaptive or lockstep-D"
     )
     first_factor: Literal["wait", "go"] | None = Field(
