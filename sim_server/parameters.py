@@ -329,10 +329,8 @@ def _draft(scene: Scene, places: Sequence[Place], kinds: Iterable[str] = ()) -> 
 
 def _with_regions(key: str, fields: Mapping[str, LiveField]) -> LiveField | None:
     """Returns the list of regions in which the constant of a key is, if there is just one such list."""
-    found = [
-        f for f in fields.values()
-        if _table(key) in (_table(f.key), _table(f.short)) and isinstance(f.value, list) and isinstance(f.value[0], Selection)
-    ]  # fmt: skip
+    beside = [f for f in fields.values() if _table(key) in (_table(f.key), _table(f.short))]
+    found = [f for f in beside if isinstance(f.value, list) and isinstance(f.value[0], Selection)]
     return found[0] if len(found) == 1 else None
 
 
