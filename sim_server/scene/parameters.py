@@ -18,6 +18,7 @@ from pydantic import (
     Field,
     ValidationError,
     ValidationInfo,
+    WithJsonSchema,
     model_validator,
 )
 from pydantic_core import InitErrorDetails, PydanticCustomError
@@ -114,13 +115,6 @@ def as_tuple(value: Any) -> Any:
     return tuple(value) if isinstance(value, list) else value
 
 
-class OfGroup(Parameters):
-    """Elements or nodes of a group of the mesh, of which an expression may choose some."""
-
-    group: str
-    where: str | None = None
-
-
 def _of_a_group(value: Any) -> Any:
     """Returns the expression of { group = "NAME" }, which may have `where` beside it; other values as they are."""
     if not isinstance(value, dict) or not {"group"} <= value.keys() <= {"group", "where"}:
@@ -164,6 +158,13 @@ NotNegative = Annotated[float, Field(ge=0)]
 Sizes = Annotated[tuple[Positive, Positive, Positive], BeforeValidator(as_tuple)]
 Count = Annotated[int, Field(ge=1, le=1_000_000)]
 Counts = Annotated[tuple[Count, Count, Count], BeforeValidator(as_tuple)]
+OF_GROUP = {
+    "type": "object",
+    "properties": {"group": {"type": "string"}, "where": {"type": "string"}},
+    "required": ["group"],
+    "additionalProperties": False,
+}
+OfGroup = Annotated[dict[str, str], WithJsonSchema(OF_GROUP)]
 Where = Annotated[
     str, BeforeValidator(_of_a_group, json_schema_input_type=str | OfGroup), AfterValidator(_readable_expression)
 ]
