@@ -32,6 +32,7 @@ python_maximum_signature_line_length = 88
 
 html_theme = "pydata_sphinx_theme"
 html_title = f"Warpfactor {release}"
+smartquotes = False  # "--web" is no dash
 html_show_sourcelink = False
 html_copy_source = False
 html_static_path = ["static"]
