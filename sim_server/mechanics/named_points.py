@@ -84,9 +84,10 @@ class NamedPoints:
         """Fetches positions and returns a named point [m]. Raises ValueError."""
         if name not in NAMES:
             raise ValueError(f"no point {name[:80]!r}; known: {', '.join(NAMES)}, or give coordinates")
-        x = self.now()
         if name == "tip":
-            return self.tip()
+            tip = self._tip  # to find it takes time once, in which the body moves on
+            return _point(self.now()[tip])
+        x = self.now()
         axis, sign = SIDES[name]
         return _point(x[int(np.where(self.free, sign * x[:, axis], -np.inf).argmax())])
 
