@@ -425,3 +425,11 @@ class Backend(Protocol):
     def push(self, host: NDArray[Any]) -> None:
         """Gives kernels the array as it is on the host. While the loop stands still."""
         ...
+
+    def view(self, host: NDArray[Any]) -> Any:
+        """Returns the memory that kernels use for the array: itself, or on a GPU its twin, a CuPy array."""
+        ...
+
+    def settle(self) -> None:
+        """Waits for what others have begun on the device, as writes to views. While the loop stands still."""
+        ...

@@ -93,11 +93,11 @@ class NamedPoints:
 
     def tip(self) -> Point:
         """Returns the position of the tip [m]."""
-        return _point(self._x[self._tip])
+        return _point(self._x[self.tip_node])
 
     @cached_property
-    def _tip(self) -> int:
-        """Number of the tip among the nodes of the body; no copy, whose place at rest is that of another node."""
+    def tip_node(self) -> int:
+        """The number of the tip among the nodes of the body; no copy, whose place at rest is that of another node."""
         n = self._nodes_of_mesh
         rest, free, there = self.body.mesh.rest[:n], self.free[:n], self._with_elements()[:n]
         fixed = there & ~free
