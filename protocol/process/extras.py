@@ -13,6 +13,8 @@ EXTRAS = {  # modules of each extra of pyproject.toml; a module of several stand
     "gpu": ("cupy", "cupyx"),
     "view": ("matplotlib", "mpl_toolkits", "PIL", "plotly", "rerun"),
     "web": ("viser", "websockets"),
+    "gym": ("gymnasium",),
+    "identify": ("optuna",),
 }
 
 

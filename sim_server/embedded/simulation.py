@@ -174,19 +174,32 @@ class Simulation:
         except ValueError as error:
             raise InputError(str(error)) from None
 
-    def reset(self, name: str = "") -> None:
-        """Puts an object, or with no name all, back to where it began; time goes on. Its pushes end, a body that was
-        frozen moves again; forces and parameters that were set stay. Raises InputError."""
-        if name:
+    def reset(self, *names: str) -> None:
+        """Puts objects, or with no name all, back to where they began; time goes on. Their pushes end, bodies that were
+        frozen move again; forces and parameters that were set stay. Raises InputError."""
+        names = tuple(name for name in names if name)
+        for name in names:
             self._nodes(name)
         driver = self._open
         driver.simulation.world.backend.settle()
-        if driver.simulation.touch is not None:
-            driver.simulation.touch.release_of(name)
-        self._start.reset(name)
+        if (touch := driver.simulation.touch) is not None:
+            with touch.together():
+                for name in names or ("",):
+                    touch.release_of(name)
+        self._start.reset(*names)
         for state in driver.bodies:
-            if name in ("", state.body.name):
+            if not names or state.body.name in names:
                 state.frozen = False
+
+    @property
+    def lost(self) -> list[str]:
+        """Objects that have run away and move no more until they are reset."""
+        return [state.body.name for state in self._open.bodies if state.frozen]
+
+    @property
+    def inside(self) -> simulations.Simulation:
+        """The simulation that is stepped, with all that sim_server has of it."""
+        return self._open.simulation
 
     def close(self) -> None:
         """Lets go of memory and device; arrays that were taken stay as they are. More than once is allowed."""

@@ -85,7 +85,7 @@ class NamedPoints:
         if name not in NAMES:
             raise ValueError(f"no point {name[:80]!r}; known: {', '.join(NAMES)}, or give coordinates")
         if name == "tip":
-            tip = self._tip  # to find it takes time once, in which the body moves on
+            tip = self.tip_node  # to find it takes time once, in which the body moves on
             return _point(self.now()[tip])
         x = self.now()
         axis, sign = SIDES[name]

@@ -20,7 +20,7 @@ def free(**tables: object) -> wf.Simulation:
 def test_a_program_adds_momentum_until_it_writes_others():
     """Force times time; each node has its own."""
     with free() as simulation:
-        mass = simulation._open.simulation.world.mass
+        mass = simulation.inside.world.mass
         simulation.forces[:, 0] = mass * 2.0
         simulation.forces[3] += (0, 0, 5.0)
         simulation.step(4)
@@ -46,7 +46,7 @@ def test_forces_of_the_weight_are_gravity(scheme):
             if gravity:
                 simulation.set("gravity.g", [0, -9.81, 0])
             else:
-                world = simulation._open.simulation.world
+                world = simulation.inside.world
                 simulation.forces = world.mass[:, None] * [0, -9.81, 0]
             records = simulation.step(8)
             found.append(simulation.x.copy())
@@ -58,7 +58,7 @@ def test_forces_of_the_weight_are_gravity(scheme):
 def test_their_work_is_known_to_the_energy_balance():
     """Of a body that forces throw by many times its size in a step it is not said that it runs away."""
     with free() as simulation:
-        world = simulation._open.simulation.world
+        world = simulation.inside.world
         simulation.forces = world.mass[:, None] * [0, 0, 1e5]
         records = simulation.step(20)
     assert (records["status"] == 0).all() and (records["kinetic"] <= records["budget"] * 1.2).all()
@@ -68,12 +68,12 @@ def test_their_work_is_known_to_the_energy_balance():
 def test_without_room_nothing_is_launched():
     """Steps of a simulation without forces are those of a server."""
     with wf.Simulation(falling(wf.Mesh(GRID.rest, GRID.tets))) as simulation:
-        names = [launch.name for launch in simulation._open.engine.launches]
+        names = [launch.name for launch in simulation.inside.engine.launches]
         assert "traction.load" not in names
         with pytest.raises(InputError, match="make the simulation with forces=True"):
             simulation.forces = (0, 0, 1)
     with free() as simulation:
-        names = [launch.name for launch in simulation._open.engine.launches]
+        names = [launch.name for launch in simulation.inside.engine.launches]
         assert names.count("traction.load") == 1
 
 
