@@ -71,6 +71,18 @@ def list_gallery(asked: bool) -> None:
     raise typer.Exit
 
 
+def print_schema(asked: bool) -> None:
+    """Option --schema: prints the JSON schema of scenes, and ends."""
+    if not asked:
+        return
+    from json import dumps
+
+    from sim_server.scene.json_schema import scene_schema
+
+    print(dumps(scene_schema(), indent=1))
+    raise typer.Exit
+
+
 @app.command(epilog=EPILOG, cls=WebCommand)
 def serve(
     scene: Annotated[Path, typer.Argument(metavar="SCENE.toml", help="What to simulate; or gallery/NAME")],
@@ -111,6 +123,12 @@ def serve(
     list_: Annotated[
         bool,
         typer.Option("--list", callback=list_gallery, is_eager=True, help="Show the scenes that come along"),
+    ] = False,
+    schema: Annotated[
+        bool,
+        typer.Option(
+            "--schema", callback=print_schema, is_eager=True, help="Print a JSON schema of scenes, for editors"
+        ),
     ] = False,
     version: Annotated[bool, PROGRAM.version_option()] = False,
 ) -> None:

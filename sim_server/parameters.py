@@ -26,6 +26,7 @@ from sim_server.scene.live import LiveField, Place, live_fields
 from sim_server.scene.messages import NAMED, readable
 from sim_server.scene.obstacles import Obstacle
 from sim_server.scene.parameters import nearest
+from sim_server.scene.regions import Selection
 
 REASONS = {  # why keys cannot change while steps run, by how they begin
     "dt": "the time step is an argument of every kernel and of the clock",
@@ -118,7 +119,7 @@ class LiveParameters:
         """Sets parameters, all between the same two steps; returns them.
 
         values: TOML, by key as after --set (object.NAME.effects.EFFECT.KEY) or a short one (NAME.EFFECT.KEY); with
-            [REGION] behind it that of one region
+            [REGION] behind it that of one region, which may be any constant that regions have
 
         Raises BadParameter; nothing changes then.
         """
@@ -127,8 +128,8 @@ class LiveParameters:
         written: dict[str, tuple[str, str]] = {}  # by full key with region: as it was given, and its value
         for key, text in values.items():
             short, region = overrides.region_of(key)
-            field = self._found(short, text, fields)
-            whole = f"{field.key}[{region}]" if region else field.key
+            field = (region and _with_regions(short, fields)) or self._found(short, text, fields)
+            whole = f"{_table(field.key)}.{_name(short)}[{region}]" if region else field.key
             if whole in written or (field.key in given and not (region and field.key not in written)):
                 raise BadParameter(f"{whole} is set twice")
             written[whole], given[field.key] = (key, text), field
@@ -298,7 +299,9 @@ def toml(value: Any) -> str:
         return "{ " + ", ".join(f"{json.dumps(key)} = {toml(each)}" for key, each in value.items()) + " }"
     if isinstance(value, list):
         return "[" + ", ".join(map(toml, value)) + "]"
-    return json.dumps(value) if isinstance(value, (str, bool)) else repr(value)
+    if isinstance(value, str):
+        return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
+    return json.dumps(value) if isinstance(value, bool) else repr(value)
 
 
 def _at(table: Any, place: Sequence[str | int]) -> Any:
@@ -324,6 +327,21 @@ def _draft(scene: Scene, places: Sequence[Place], kinds: Iterable[str] = ()) -> 
         listed: Sequence[SceneObject | Obstacle] = scene.objects if kind == "object" else scene.obstacles or []
         draft[kind] = [_plain(each) if index in touched else _named(each) for index, each in enumerate(listed)]
     return draft
+
+
+def _with_regions(key: str, fields: Mapping[str, LiveField]) -> LiveField | None:
+    """Returns the list of regions in which the constant of a key is, if there is just one such list."""
+    beside = [f for f in fields.values() if _table(key) in (_table(f.key), _table(f.short))]
+    found = [f for f in beside if isinstance(f.value, list) and isinstance(f.value[0], Selection)]
+    return found[0] if len(found) == 1 else None
+
+
+def _table(key: str) -> str:
+    return key.rpartition(".")[0]
+
+
+def _name(key: str) -> str:
+    return key.rpartition(".")[2]
 
 
 def _field(table: BaseModel, name: str) -> Any:

@@ -152,7 +152,7 @@ class Simulation:
         return EngineInput(
             assemble, integrate, names, ranges, w.dt, self.scene.solver, self.energies, newton, stages, euler, substeps,
             contact, touch, held, self.scene.accuracy is not None, self._rank_one(), arrays, history,
-            self.cutting.cut_input() if self.cutting else None, self.measured, short,
+            self.cutting.cut_input(s, self.integrator.carried) if self.cutting else None, self.measured, short,
         )  # fmt: skip
 
     def _halving(self, mailed: Mapping[str, Launch], effects: list[Effect]) -> Halving:

@@ -34,7 +34,7 @@ ALLOWED = {  # what each folder imports of its package
 }
 ORDER = (  # of sim_server: each imports of those before it
     "errors", "arrays", "kernels", "mesh", "scene", "backends", "mechanics", "effects", "parameters", "simulation",
-    "state", "updates", "checkpoint", "network", "recording", "service", "explain", "replay", "embedded", "cli",
+    "state", "updates", "checkpoint", "network", "recording", "service", "explain", "replay", "embedded", "gym", "cli",
     "__main__",
 )  # fmt: skip
 REGISTRY = ("scene", "effects")  # a scene looks the names of effects up; the effects that it lists are imported later

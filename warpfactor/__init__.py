@@ -4,6 +4,7 @@
 wf.Simulation, wf.Scene, wf.Mesh   simulate in this process; they need the extra server
 wf.Client                          a server that runs: push, grab, watch, steer
 wf.Log                             what a run has recorded
+wf.gym                             environments of gymnasium; they need the extra gym
 
 Names are imported when they are first used, so that a client needs no more than a client.
 """
@@ -16,9 +17,10 @@ from protocol.process.extras import missing_extra
 if TYPE_CHECKING:
     from clients.client import Client
     from clients.log.reader import Log
+    from sim_server import gym
     from sim_server.embedded import Mesh, Scene, Simulation
 
-__all__ = ["Client", "Log", "Mesh", "Scene", "Simulation"]
+__all__ = ["Client", "Log", "Mesh", "Scene", "Simulation", "gym"]
 
 _PLACES = {
     "Client": "clients.client",
@@ -26,6 +28,7 @@ _PLACES = {
     "Mesh": "sim_server.embedded",
     "Scene": "sim_server.embedded",
     "Simulation": "sim_server.embedded",
+    "gym": "sim_server.gym",
 }
 
 
@@ -33,7 +36,7 @@ def __getattr__(name: str) -> Any:
     if name not in _PLACES:
         raise AttributeError(f"module 'warpfactor' has no attribute {name!r}; there is {', '.join(__all__)}")
     try:
-        found = getattr(import_module(_PLACES[name]), name)
+        found = getattr(place := import_module(_PLACES[name]), name, place)
     except ModuleNotFoundError as error:
         if advice := missing_extra(error):
             raise ModuleNotFoundError(f"warpfactor.{name}: {advice}", name=error.name) from error

@@ -377,6 +377,7 @@ class CutInput:
     bodies: indices of those that may; at_rest, changed_at, free (nodes,): as in effects/cutting.py
     spawn: launch that begins copies of nodes after parameters have changed, None if none are; origin, copied_at
         (nodes,): where they come from and since when, as in effects/cutting_split.cu
+    most_blocks: of A of each body of the scene, however it is split; none: the pattern stays
     """
 
     bodies: Sequence[int]
@@ -386,6 +387,7 @@ class CutInput:
     spawn: Launch | None = None
     origin: Int32 | None = None
     copied_at: Float64 | None = None
+    most_blocks: Sequence[int] = ()
 
 
 class Backend(Protocol):
@@ -422,4 +424,12 @@ class Backend(Protocol):
 
     def push(self, host: NDArray[Any]) -> None:
         """Gives kernels the array as it is on the host. While the loop stands still."""
+        ...
+
+    def view(self, host: NDArray[Any]) -> Any:
+        """Returns the memory that kernels use for the array: itself, or on a GPU its twin, a CuPy array."""
+        ...
+
+    def settle(self) -> None:
+        """Waits for what others have begun on the device, as writes to views. While the loop stands still."""
         ...

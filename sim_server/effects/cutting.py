@@ -55,6 +55,7 @@ from sim_server.scene.parameters import Parameters, complaint
 
 SCOPE = "object"
 MOST_SPARES = 1_000_000
+SPLIT_SCHEMES = "backward_euler", "newmark", "bdf2", "generalized_alpha", "central_difference"
 
 
 def _numbers(text: str) -> str:
@@ -134,7 +135,6 @@ class Cutting(Effect):
         world.without_elements = self.at_rest
         world.backend.keep(self._before, self.at_rest)
         world.backend.keep(self.changed_at, exact=True)
-        self._spawn: Launch | None = None
         if world.splitting is not None:
             self._keep_spares()
 
@@ -143,8 +143,6 @@ class Cutting(Effect):
         w = self.world
         assert w.splitting is not None
         splitting, name = w.splitting, self.bodies[0].name
-        if w.backend.name == "gpu":
-            raise InputError(f"object {name!r}, effect cutting: spare: objects are split on a CPU alone: --device cpu")
         if w.holders:
             raise InputError(
                 f"object {name!r}, effect cutting: spare: objects of a scene with holders cannot be split; allowed: "
@@ -152,6 +150,8 @@ class Cutting(Effect):
             )
         self.origin: Int32 = w.follow("cutting", compute=lambda scene: splitting.nodes(scene, "origin"))
         self._origin_before, self.copied_at = self.origin.copy(), np.full(w.nodes, -1.0)
+        w.backend.keep(self._origin_before)
+        w.backend.keep(self.copied_at, exact=True)
         self.at_rest[self.origin < 0] = 1
 
     def _parts(self, scene: Scene) -> Float64:
@@ -182,7 +182,8 @@ class Cutting(Effect):
         w, origin, waiting = self.world, np.zeros(0, np.int32), np.zeros(0, np.int64)
         if w.splitting is not None:
             origin = w.splitting.nodes(scene, "origin")
-            waiting = np.flatnonzero((origin >= 0) & (self._origin_before < 0))  # before x is read, which has more then
+            before = w.backend.fetch(self._origin_before)  # before x is read, which has more then
+            waiting = np.flatnonzero((origin >= 0) & (before < 0))
         x = w.backend.fetch(w.x).copy()
         for node in waiting:  # in their order, as copies follow what they come from
             x[node] = x[origin[node]]
@@ -224,8 +225,10 @@ class Cutting(Effect):
         if wrong := [name for name in named if not effects[name].splittable(body)]:
             raise self._refusal(body, f"spare: objects of a scene with the effect {wrong[0]} cannot be split")
         scheme = w.at_start(lambda scene: scene.integrator.scheme)
-        if scheme != "backward_euler":
-            raise self._refusal(body, f"spare: objects are not split in the scheme {scheme}; allowed: backward_euler")
+        if scheme not in SPLIT_SCHEMES:
+            raise self._refusal(
+                body, f"spare: objects are not split in the scheme {scheme}; allowed: {', '.join(SPLIT_SCHEMES)}"
+            )
 
     def join(self, others: Sequence[Effect]) -> None:
         """Says what may be touched before the first step, once all that is fixed is known."""
@@ -255,12 +258,21 @@ class Cutting(Effect):
     def comes_first(self) -> bool:
         return True
 
-    def cut_input(self) -> CutInput:
-        """Returns what keeps factors useful that were made before a cut."""
-        given = CutInput([body.index for body in self.bodies], self.at_rest, self.changed_at, self.world.free)
-        if self._spawn is None:
+    def cut_input(self, system: System, histories: Sequence[Float64]) -> CutInput:
+        """Returns what engines need to know of cuts. histories: arrays (n, 3) that the scheme carries on, at most 3,
+        beside those of the world and `dv`"""
+        w = self.world
+        given = CutInput([body.index for body in self.bodies], self.at_rest, self.changed_at, w.free)
+        if w.splitting is None:
             return given
-        return replace(given, spawn=self._spawn, origin=self.origin, copied_at=self.copied_at)
+        first, second, third = (histories[k] if k < len(histories) else w.v for k in range(3))
+        spawn = w.backend.module("effects/cutting_split.cu").bind(
+            "spawn", w.nodes, origin=self.origin, origin_before=self._origin_before, x=w.x, v=w.v,
+            predictor=w.predictor, damping_velocity=w.damping_velocity, dv=system.dv, first=first, second=second,
+            third=third, free=w.free, at_rest=self.at_rest,
+        )  # fmt: skip
+        most = [system.most_blocks(body.first, body.last) for body in w.bodies]
+        return replace(given, spawn=spawn, origin=self.origin, copied_at=self.copied_at, most_blocks=most)
 
     def launches(self, system: System, stencil: Stencil | None, accumulate: bool) -> list[Launch]:
         w = self.world
@@ -271,13 +283,7 @@ class Cutting(Effect):
         )  # fmt: skip
         if w.splitting is None:
             return [settle]
-        text = w.backend.module("effects/cutting_split.cu")
-        self._spawn = text.bind(
-            "spawn", w.nodes, origin=self.origin, origin_before=self._origin_before, x=w.x, v=w.v,
-            predictor=w.predictor, damping_velocity=w.damping_velocity, dv=system.dv, free=w.free,
-            at_rest=self.at_rest,
-        )  # fmt: skip
-        note = text.bind(
+        note: Launch = w.backend.module("effects/cutting_split.cu").bind(
             "note", w.nodes, origin=self.origin, clock=system.clock, origin_before=self._origin_before,
             copied_at=self.copied_at,
         )  # fmt: skip

@@ -11,6 +11,9 @@ struct Spawn {
     real* predictor;           // (n, 3) in, out [m/s]
     real* damping_velocity;    // (n, 3) in, out [m/s]
     real* dv;                  // (n, 3) in, out: solution of the last step [m/s]
+    real* first;               // (n, 3) in, out, as the next two: what else the scheme carries on, or v
+    real* second;
+    real* third;
     real* free;                // (n,) in, out: 0 at nodes that do not move
     real* at_rest;             // (n,) in, out: 1 at nodes without elements
 };
@@ -26,6 +29,9 @@ KERNEL(spawn, Spawn) {
         p.predictor[3 * i + k] = p.predictor[3 * from + k];
         p.damping_velocity[3 * i + k] = p.damping_velocity[3 * from + k];
         p.dv[3 * i + k] = p.dv[3 * from + k];
+        p.first[3 * i + k] = p.first[3 * from + k];
+        p.second[3 * i + k] = p.second[3 * from + k];
+        p.third[3 * i + k] = p.third[3 * from + k];
     }
     p.free[i] = p.free[from];
     p.at_rest[i] = p.at_rest[from];

@@ -35,7 +35,7 @@ from sim_server.mechanics.system import Stencil, System
 from sim_server.mechanics.world import Body, World
 from sim_server.scene import Scene
 from sim_server.scene.live import Live
-from sim_server.scene.parameters import NotNegative, Positive, complaint
+from sim_server.scene.parameters import NotNegative, Positive, Vector, complaint
 
 SCOPE = "object"
 
@@ -58,7 +58,9 @@ def _as_listed(families: tuple[float, ...]) -> list[list[float]]:
 
 
 Families = Annotated[
-    tuple[float, float, float, float, float, float], BeforeValidator(_families), PlainSerializer(_as_listed)
+    tuple[float, float, float, float, float, float],
+    BeforeValidator(_families, json_schema_input_type=Vector | list[Vector]),
+    PlainSerializer(_as_listed),
 ]
 TEXT = "effects/fibres.cu"
 LAW = Law(

@@ -53,7 +53,7 @@ def _three(value: Any) -> Any:
 LAW = Law(
     "growth",
     (
-        Constant("expansion", Annotated[Vector, BeforeValidator(_three)],
+        Constant("expansion", Annotated[Vector, BeforeValidator(_three, json_schema_input_type=float | Vector)],
                  "strain, or [x, y, z], of an amount of 1 [-], or a list of regions", live=Live()),
         Constant("amount", float, "that expansion is multiplied by: a difference of temperature, or a part [-]", 1.0,
                  live=Live(0, 1)),

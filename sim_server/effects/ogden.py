@@ -23,7 +23,7 @@ rubberlike solids, Proceedings of the Royal Society A 326, 1972; the eigensystem
 from typing import Annotated, Any
 
 import numpy as np
-from pydantic import BeforeValidator
+from pydantic import BeforeValidator, Field
 
 from sim_server.arrays import Float64
 from sim_server.effects._hyperelastic import Constant, Hyperelastic, Law, Values, of_shear_and_bulk
@@ -42,7 +42,10 @@ def _terms(value: Any) -> Any:
     return (*value, *[0.0] * (TERMS - len(value)))
 
 
-Terms = Annotated[tuple[float, float, float], BeforeValidator(_terms)]
+Terms = Annotated[
+    tuple[float, float, float],
+    BeforeValidator(_terms, json_schema_input_type=Annotated[list[float], Field(min_length=1, max_length=TERMS)]),
+]
 
 
 def pack(values: Values) -> list[Float64]:

@@ -76,6 +76,10 @@ class CentralDifferenceIntegrator(Integrator):
     def still(self) -> list[np.ndarray]:
         return [self.world.predictor, self.inertial_increment]
 
+    @property
+    def carried(self) -> list[np.ndarray]:
+        return [self.before, self.inertial_increment, self.mode]
+
     def start(self) -> Launch:
         """Begins the forces."""
         s = self.system

@@ -37,9 +37,10 @@ def collected_energies(
     world.backend.keep(gravity)
     balance = np.zeros(len(world.bodies), structs.BALANCE)
     driving = {effect.name for effect in effects.values() if "load" in effect.balance_arrays()} - {"traction"}
+    unlisted = driving - {name for body in world.bodies for name in body.effects}  # of all nodes
     for body, b in zip(world.bodies, balance, strict=True):
         b["mass"] = world.mass[body.nodes].sum()
-        b["driven"] = float(bool(driving & body.effects.keys()))
+        b["driven"] = float(bool(unlisted or driving & body.effects.keys()))
         b["slack"] = SLACK_OF_SUBSTEPS if world.explicit else 0
         b["diagonal"] = np.linalg.norm(np.ptp(world.rest[body.nodes], axis=0))
     return Energies(

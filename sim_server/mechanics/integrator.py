@@ -125,6 +125,11 @@ class Integrator:
         """Arrays (n, 3) other than v that are 0 in a body at rest."""
         return [] if self.world.plain else [self.world.predictor, self.world.damping_velocity, self.inertial_increment]
 
+    @property
+    def carried(self) -> list[np.ndarray]:
+        """Arrays (n, 3) that a step leaves to the next beside those of the world and dv."""
+        return [self.before] if self.world.plain else [self.before, self.inertial_increment]
+
     def start(self) -> Launch:
         """Sets b and A to the terms of inertia."""
         s, w = self.system, self.world

@@ -84,19 +84,20 @@ class NamedPoints:
         """Fetches positions and returns a named point [m]. Raises ValueError."""
         if name not in NAMES:
             raise ValueError(f"no point {name[:80]!r}; known: {', '.join(NAMES)}, or give coordinates")
-        x = self.now()
         if name == "tip":
-            return self.tip()
+            tip = self.tip_node  # to find it takes time once, in which the body moves on
+            return _point(self.now()[tip])
+        x = self.now()
         axis, sign = SIDES[name]
         return _point(x[int(np.where(self.free, sign * x[:, axis], -np.inf).argmax())])
 
     def tip(self) -> Point:
         """Returns the position of the tip [m]."""
-        return _point(self._x[self._tip])
+        return _point(self._x[self.tip_node])
 
     @cached_property
-    def _tip(self) -> int:
-        """Number of the tip among the nodes of the body; no copy, whose place at rest is that of another node."""
+    def tip_node(self) -> int:
+        """The number of the tip among the nodes of the body; no copy, whose place at rest is that of another node."""
         n = self._nodes_of_mesh
         rest, free, there = self.body.mesh.rest[:n], self.free[:n], self._with_elements()[:n]
         fixed = there & ~free

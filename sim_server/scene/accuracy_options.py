@@ -8,7 +8,7 @@ from typing import Annotated, Any
 from pydantic import Field, PlainValidator
 
 from sim_server.arrays import Float64
-from sim_server.scene.parameters import Parameters, complaint
+from sim_server.scene.parameters import Parameters, Positive, complaint
 
 MOST_LINEARIZATIONS = 8  # of a step, where the scene does not say
 LONGEST = sys.float_info.max  # m
@@ -32,7 +32,7 @@ def _percent(text: str) -> float | None:
 class AccuracyOptions(Parameters):
     """How exact steps are to be."""
 
-    position: Annotated[float | str, PlainValidator(_position)] = Field(
+    position: Annotated[float | str, PlainValidator(_position, json_schema_input_type=Positive | str)] = Field(
         description="largest estimated error of a node's position in a step [m], or 'P %' of the object's size"
     )
 

@@ -28,7 +28,7 @@ class AlphaParameters(NamedTuple):
 class IntegratorOptions(Parameters):
     """The scheme of time integration, and the linearizations and line search of a step."""
 
-    scheme: SchemeName = "backward_euler"
+    scheme: SchemeName = Field(default="backward_euler", description="of time integration")
     beta: float | None = Field(default=None, gt=0, le=1, description="of Newmark's scheme [-]; default 1/4")
     gamma: float | None = Field(default=None, ge=0.5, le=1, description="of Newmark's scheme [-]; default 1/2")
     spectral_radius: float | None = Field(

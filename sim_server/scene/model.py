@@ -55,7 +55,7 @@ def _dumped_effects(effects: dict[str, BaseModel]) -> dict[str, Any]:
 class SceneObject(Parameters):
     """One deformable object."""
 
-    name: Name
+    name: Name = Field(description="part of keys, logs and commands")
     mesh: MeshSource
     skin: File | None = Field(
         default=None, description="a finer surface that moves with the mesh, for viewers; a file that meshio reads"
@@ -77,7 +77,9 @@ class SceneObject(Parameters):
     friction: Annotated[NotNegative | None, Live(0, 1.5)] = Field(
         default=None, description="coefficient of its surface [-]; 0.5 where the scene lists contact"
     )
-    effects: Annotated[dict[str, BaseModel], *_effects("object")] = Field(default_factory=dict)
+    effects: Annotated[dict[str, BaseModel], *_effects("object")] = Field(
+        default_factory=dict, description="what acts on it, by name"
+    )
 
     _given: Mesh | None = PrivateAttr(None)
     _keeps_mid_nodes: bool = PrivateAttr(False)
@@ -135,7 +137,7 @@ class RecordOptions(Parameters):
     every: Count = Field(
         default=1, description="steps from one state frame to the next; per-step scalars are always recorded"
     )
-    compression: Literal["lz4", "zstd", "none"] = "lz4"
+    compression: Literal["lz4", "zstd", "none"] = Field(default="lz4", description="of the log")
 
 
 def _some_objects(objects: list[SceneObject]) -> list[SceneObject]:
@@ -151,8 +153,12 @@ class Scene(Parameters):
     """A whole scene file."""
 
     dt: Positive = Field(description="time step [s]")
-    name: Annotated[str, Field(min_length=1, max_length=200)]
-    effects: Annotated[dict[str, BaseModel], *_effects("scene")] = Field(default_factory=dict)
+    name: Annotated[str, Field(min_length=1, max_length=200)] = Field(
+        description="for logs and clients; that of the file if left out"
+    )
+    effects: Annotated[dict[str, BaseModel], *_effects("scene")] = Field(
+        default_factory=dict, description="what acts on the whole scene, by name"
+    )
     integrator: IntegratorOptions = IntegratorOptions()
     solver: SolverOptions = SolverOptions()
     accuracy: AccuracyOptions | None = None

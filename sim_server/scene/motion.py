@@ -21,11 +21,11 @@ class Keyframe(Pose):
 class Moved(Parameters):
     """Base of what is fixed, moved along keyframes, or moved by a client."""
 
-    name: Name
+    name: Name = Field(description="for clients and logs")
     keyframes: Annotated[list[Keyframe], Field(min_length=1)] | None = Field(
         default=None, description="poses at ascending times, held before the first and after the last"
     )
-    moved: Literal["client"] | None = None
+    moved: Literal["client"] | None = Field(default=None, description="clients give its poses")
     max_speed: Positive | None = Field(default=None, description="at which it goes to a client's pose [m/s]")
     max_turn: Positive | None = Field(default=None, description="at which it turns to a client's pose [rad/s]")
 

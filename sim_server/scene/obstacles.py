@@ -23,7 +23,7 @@ KEYS = {  # of each shape: those that it must have
 class Obstacle(Moved):
     """A rigid shape that objects touch: fixed, moved along keyframes, or moved by a client."""
 
-    shape: Literal["plane", "sphere", "box", "capsule", "grid"]
+    shape: Literal["plane", "sphere", "box", "capsule", "grid"] = Field(description="in a frame that pose places")
     radius: Positive | None = Field(default=None, description="of a sphere or a capsule [m]")
     size: Sizes | None = Field(default=None, description="of a box along x, y, z [m]")
     length: Positive | None = Field(default=None, description="of the axis of a capsule, along y [m]")

@@ -16,7 +16,8 @@ Place = tuple[str | int, ...]
 
 def apply(override: str, table: dict[str, Any]) -> Place:
     """Sets one value of a parsed scene: ``solver.tolerance=1e-8``, ``object.NAME.effects.corotational.young=1e6``,
-    ``obstacle.NAME.friction=0.2``, ``...young[REGION]=2e4``; returns its place. Raises InputError as `assign` does.
+    ``obstacle.NAME.friction=0.2``, ``...young[REGION]=2e4``, ``...poisson[REGION]=0.4``; returns its place. Raises
+    InputError as `assign` does.
     """
     key, equals, text = override.partition("=")
     text = text.strip()
@@ -55,9 +56,11 @@ def assign(key: str, given: Any, text: str, table: dict[str, Any], replace: bool
         place = below
     there: Any = place.get(last)
     if region:
+        listed = _list_of_regions(place, last)
+        there = place.get(listed)
         index = _index(there, region, last)
-        place[last] = [{**each, last: given} if k == index else each for k, each in enumerate(there)]
-        return (*at, *parents, last, index, last)
+        place[listed] = [{**each, last: given} if k == index else each for k, each in enumerate(there)]
+        return (*at, *parents, listed, index, last)
     if _tables(there) and not _tables(given):
         raise InputError(
             f"{last} is a list of {len(there)} regions in the scene, which one value would take the place of; allowed: "
@@ -73,6 +76,15 @@ def region_of(key: str) -> tuple[str, str]:
     """Returns a key without the name of a region at its end, and that name: young[tumour]; "" without one."""
     found = re.fullmatch(r"([^\[\]]*)\[(.+)\]", key)
     return (found.group(1), found.group(2)) if found else (key, "")
+
+
+def _list_of_regions(table: dict[str, Any], key: str) -> str:
+    """Returns the key of the list of regions which may have a constant: a law has one, of its first constant.
+
+    All regions have that constant, which tells their list from others.
+    """
+    lists = [k for k, value in table.items() if _tables(value) and all(k in region for region in value)]
+    return key if key in lists or len(lists) != 1 else lists[0]
 
 
 def _index(regions: Any, name: str, key: str) -> int:

@@ -18,6 +18,7 @@ from pydantic import (
     Field,
     ValidationError,
     ValidationInfo,
+    WithJsonSchema,
     model_validator,
 )
 from pydantic_core import InitErrorDetails, PydanticCustomError
@@ -157,5 +158,14 @@ NotNegative = Annotated[float, Field(ge=0)]
 Sizes = Annotated[tuple[Positive, Positive, Positive], BeforeValidator(as_tuple)]
 Count = Annotated[int, Field(ge=1, le=1_000_000)]
 Counts = Annotated[tuple[Count, Count, Count], BeforeValidator(as_tuple)]
-Where = Annotated[str, BeforeValidator(_of_a_group), AfterValidator(_readable_expression)]
+OF_GROUP = {
+    "type": "object",
+    "properties": {"group": {"type": "string"}, "where": {"type": "string"}},
+    "required": ["group"],
+    "additionalProperties": False,
+}
+OfGroup = Annotated[dict[str, str], WithJsonSchema(OF_GROUP)]
+Where = Annotated[
+    str, BeforeValidator(_of_a_group, json_schema_input_type=str | OfGroup), AfterValidator(_readable_expression)
+]
 File = Annotated[str, AfterValidator(_found)]

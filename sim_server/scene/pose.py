@@ -13,7 +13,7 @@ class Pose(Parameters):
     """Rotation about the fixed axes x, then y, then z, followed by a translation."""
 
     rotate: Vector = Field(default=(0.0, 0.0, 0.0), description="angles [degrees]")
-    translate: Vector = Field(default=(0.0, 0.0, 0.0), description="[m]")
+    translate: Vector = Field(default=(0.0, 0.0, 0.0), description="displacement, after the rotation [m]")
 
 
 def quaternion(rotate: Sequence[float]) -> tuple[float, float, float, float]:

@@ -26,8 +26,8 @@ class Part(Protocol):
 
 
 class Sphere(Parameters):
-    radius: Positive = Field(description="[m]")
-    center: Vector = Field(default=(0.0, 0.0, 0.0), description="[m]")
+    radius: Positive = Field(description="distance of the surface from the middle [m]")
+    center: Vector = Field(default=(0.0, 0.0, 0.0), description="the middle [m]")
 
     def distances(self, points: Float64) -> Float64:
         return np.asarray(np.linalg.norm(points - self.center, axis=1) - self.radius)
@@ -40,7 +40,7 @@ class Box(Parameters):
     """A box along the axes; round: radius of its edges and corners."""
 
     size: Sizes = Field(description="along x, y, z [m]")
-    center: Vector = Field(default=(0.0, 0.0, 0.0), description="[m]")
+    center: Vector = Field(default=(0.0, 0.0, 0.0), description="the middle [m]")
     round: NotNegative = Field(default=0.0, description="radius of its edges [m]")
 
     @model_validator(mode="after")
@@ -61,9 +61,9 @@ class Box(Parameters):
 class Capsule(Parameters):
     """All points within a radius of a segment."""
 
-    begin: Vector = Field(description="of the segment [m]")
-    end: Vector = Field(description="of the segment [m]")
-    radius: Positive = Field(description="[m]")
+    begin: Vector = Field(description="first end of the segment [m]")
+    end: Vector = Field(description="second end of the segment [m]")
+    radius: Positive = Field(description="distance of the surface from the segment [m]")
 
     def distances(self, points: Float64) -> Float64:
         begin, along = np.array(self.begin), np.array(self.end) - self.begin
@@ -78,7 +78,7 @@ class Capsule(Parameters):
 class Shape(Parameters):
     """One of sphere, box, capsule and union; smooth: how far from where parts of a union meet they are blended."""
 
-    sphere: Sphere | None = None
+    sphere: Sphere | None = Field(default=None, description="a sphere")
     box: Box | None = None
     capsule: Capsule | None = None
     union: Annotated[list["Shape"], Field(min_length=1, max_length=1000)] | None = None

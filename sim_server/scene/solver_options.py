@@ -15,6 +15,7 @@ Preconditioner = Literal[
 ]
 PRECONDITIONERS: tuple[str, ...] = get_args(Preconditioner)
 FACTORS = ("cholesky", "incomplete_cholesky", "ssor_factor")  # made by workers, from an older matrix
+UpdateText = Annotated[str, Field(pattern=r"^(never|async|adaptive|(every|lockstep)-[1-9][0-9]{0,5})$")]
 CPU_ONLY = ("ssor", "ssor_factor", "incomplete_cholesky")  # sweeps and sparse solves are sequential
 
 
@@ -74,8 +75,12 @@ class SolverOptions(Parameters):
     tolerance: float = Field(
         default=1e-6, gt=0, lt=1, description="bound of the true residual: |b - A dv| <= tolerance |b|"
     )
-    max_iterations: int = Field(default=500, ge=1, le=1_000_000)
-    preconditioner: Annotated[Preconditioner, PlainValidator(_preconditioner)] = "auto"
+    max_iterations: int = Field(
+        default=500, ge=1, le=1_000_000, description="of a solve; then the step goes on with what it has"
+    )
+    preconditioner: Annotated[
+        Preconditioner, PlainValidator(_preconditioner, json_schema_input_type=Preconditioner)
+    ] = Field(default="auto", description="of the conjugate gradients; auto: chosen by measurement")
     omega: float = Field(default=1.0, gt=0, lt=2, description="relaxation of ssor and ssor_factor")
     drop_tolerance: float = Field(
         default=0.003, ge=0, lt=1, description="incomplete_cholesky drops blocks of L below this times a row's norm"
@@ -90,7 +95,9 @@ class SolverOptions(Parameters):
     projection: Literal["auto", "excess", "clamp", "absolute", "none"] = Field(
         default="auto", description="treatment of negative eigenvalues of the stiffness of an element"
     )
-    update: Annotated[Update, PlainValidator(_update), PlainSerializer(str)] = Update("async")
+    update: Annotated[Update, PlainValidator(_update, json_schema_input_type=UpdateText), PlainSerializer(str)] = Field(
+        default=Update("async"), description="when factors are made: never, every-N, async, adaptive or lockstep-D"
+    )
     first_factor: Literal["wait", "go"] | None = Field(
         default=None, description="a server's first step waits for its own factors or goes; None: waits in real time"
     )
@@ -106,7 +113,7 @@ class SolverOptions(Parameters):
     on_runaway: OnRunaway = Field(
         default="freeze", description="treatment of a body with more energy than accounted for"
     )
-    threads: int = Field(default=1, ge=1, le=1024)
+    threads: int = Field(default=1, ge=1, le=1024, description="of the simulation on a CPU")
     warm_start: bool = Field(default=True, description="start from the last step's dv")
     woodbury: int = Field(
         default=32, ge=0, le=64,

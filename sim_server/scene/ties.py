@@ -14,7 +14,7 @@ from sim_server.scene.parameters import Name, NotNegative, Parameters, Positive,
 class Attachment(Parameters):
     """Nodes of an object that stick to the surface of another one, or to an obstacle."""
 
-    name: Name
+    name: Name = Field(description="for clients and logs")
     object: str = Field(description="whose nodes are attached")
     where: Where = Field(description="nodes: an expression in X, Y, Z, the rest coordinates [m]")
     to: str = Field(description="another object, or an obstacle")
@@ -28,17 +28,19 @@ class Attachment(Parameters):
 class SpringEnd(Parameters):
     """A node of an object: the nearest one to a point."""
 
-    object: str
+    object: str = Field(description="name of the object")
     at: Vector = Field(description="rest coordinates [m]")
 
 
 class Spring(Parameters):
     """A spring between two nodes, of one object or of two."""
 
-    name: Name
-    between: Annotated[list[SpringEnd], Field(min_length=2, max_length=2)]
-    stiffness: Positive = Field(description="[N/m]")
-    rest_length: NotNegative | None = Field(default=None, description="[m]; the distance at the start if left out")
+    name: Name = Field(description="for clients and logs")
+    between: Annotated[list[SpringEnd], Field(min_length=2, max_length=2)] = Field(description="its two ends")
+    stiffness: Positive = Field(description="force by elongation [N/m]")
+    rest_length: NotNegative | None = Field(
+        default=None, description="length without force [m]; the distance at the start if left out"
+    )
     breaking: Positive | None = Field(default=None, description="force that breaks it [N]")
 
 

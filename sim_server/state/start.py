@@ -31,23 +31,24 @@ class Start:
         simulation.engine.prepare()
         self._arrays = [(a, a.read()) for a in state_arrays(simulation) if a.resets]
 
-    def reset(self, name: str = "") -> None:
-        """Puts an object with its holders, or the whole scene (no name), back. Raises KeyError for an unknown one.
+    def reset(self, *only: str) -> None:
+        """Puts objects with their holders, or the whole scene (no name), back. Raises KeyError for an unknown one.
 
-        Of all that touches the object, or is tied to it, the forces, friction and breaks are forgotten. What was cut is
-        whole again. Parameters that were set stay, and the loop has those that wait before.
+        Of all that touches the objects, or is tied to them, the forces, friction and breaks are forgotten. What was cut
+        is whole again. Parameters that were set stay, and the loop has those that wait before.
         """
         s = self._simulation
-        bodies = [s.world.body(name).index] if name else [b.index for b in s.world.bodies]
+        only = tuple(name for name in only if name)
+        bodies = [s.world.body(name).index for name in only] or [b.index for b in s.world.bodies]
         names = [s.world.bodies[index].name for index in bodies]
         s.parameters.take_back(key.format(name) for key in (KEY, SPLIT) for name in names)
         s.engine.take_changes()
-        back = self._arrays if not name else [(a, _with_rows(a, v, bodies[0])) for a, v in self._arrays if a.rows]
+        back = self._arrays if not only else [(a, _with_rows(a, v, bodies)) for a, v in self._arrays if a.rows]
         for array, value in back:
             array.write(value)
         time = s.engine.loop.start_time + s.engine.step * s.world.dt
         for mover in s.movers:
-            mover.restart([k for k, o in enumerate(mover.listed) if not name or getattr(o, "object", "") == name], time)
+            mover.restart([k for k, o in enumerate(mover.listed) if not only or getattr(o, "object", "") in only], time)
         if s.parameters.changed:
             self._begin_again(bodies)
         s.engine.restart(bodies)
@@ -68,9 +69,10 @@ class Start:
             s.world.backend.push(each)
 
 
-def _with_rows(array: StateArray, start: NDArray[Any], body: int) -> NDArray[Any]:
-    """Returns the array as it is, with the rows of a body as they were at the start."""
+def _with_rows(array: StateArray, start: NDArray[Any], bodies: Sequence[int]) -> NDArray[Any]:
+    """Returns the array as it is, with the rows of bodies as they were at the start."""
     assert array.rows is not None
-    now, rows = array.read(), array.rows(body)
-    now[rows] = start[rows]
+    now = array.read()
+    for rows in [array.rows(body) for body in bodies]:
+        now[rows] = start[rows]
     return now

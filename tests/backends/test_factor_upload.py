@@ -62,6 +62,9 @@ class Maker:
         self.events.append(Event(self.scene))
         return PartitionedInverse(storage, self.events[-1])
 
+    def forget_plans(self, patterns: set[int]) -> None:
+        self.known = patterns
+
     def use(self, body: int, pattern: SimpleNamespace, inverse: PartitionedInverse, step: int) -> None:
         self.bodies["factor"] = inverse.storage[0]
 
@@ -144,6 +147,16 @@ def test_what_was_launched_with_a_factor_ends_before_its_storage_is_written_agai
     uploads.leaving = (uploads.in_use, scene.loop.step)
     upload.advance()
     assert [t[0] for t in maker.storages] == [3, 2]
+
+
+def test_plans_are_kept_of_the_last_two_patterns_alone(parts):
+    """Each split of an object makes another one."""
+    scene, maker, upload = parts
+    for number in range(1, 6):
+        upload.post(0, SimpleNamespace(id=number), np.array([number]), 0)
+        upload.settle()
+        scene.loop.run(1)
+        assert maker.known == {*range(max(1, number - 1), number + 1)}
 
 
 def test_settled_means_used_by_the_next_step_even_if_others_wait(parts):

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: MIT
 """Scenes are built for a GPU where there is none: texts compile with the options of a run, and launches fit kernels."""
 
+import ctypes as c
+
 import numpy as np
 import pytest
 
@@ -9,9 +11,10 @@ from sim_server.backends.gpu import device
 from sim_server.backends.gpu.inverse.build_inverse import InverseBuilder
 from sim_server.backends.gpu.inverse.plan import plan
 from sim_server.backends.gpu.islands import OWN_SURFACES
+from sim_server.backends.gpu.newton import own_blocks
 from sim_server.checkpoint.content import capture
-from sim_server.errors import InputError
 from sim_server.explain.explanation import explain
+from sim_server.scene.model import Scene
 from sim_server.simulation import Simulation
 from sim_server.state.arrays import state_arrays
 from sim_server.state.code import build_id
@@ -19,6 +22,8 @@ from sim_server.state.start import Start
 from sim_server.updates.driver import Driver
 from tests.backends import fake_cupy
 from tests.contact.scenes import block, floor, over, ram
+from tests.cutting.cut_scenes import table as cut_table
+from tests.cutting.split_scenes import SLIT, split
 from tests.holders.holder_scenes import held_bar, left, right
 from tests.own_effect.own_package import install, with_own_header
 from tests.resets.going_on import resumed
@@ -71,6 +76,7 @@ SCENES = {
     ),
     "beam.toml, cut": ("object.beam.effects.cutting=true", "solver.precision=mixed"),
     "fibres.toml, cut in float32": ("object.beam.effects.cutting.removed='3-7'", "solver.precision=float32"),
+    "beam.toml, split": ("object.beam.effects.cutting.spare=50", "object.beam.elements=linear"),
     "springs.toml, cut": ("object.block.effects.cutting=true", "integrator.scheme=bdf2"),
     "beam.toml, prony in float32": (
         "object.beam.effects.prony.terms=[{ g = 0.5, tau = 0.1 }, { g = 0.2, tau = 1 }]",
@@ -335,10 +341,53 @@ def test_bodies_that_are_told_not_to_touch_each_other_have_nothing_of_it(cupy):
     assert not any("pair" in kernel or "island" in kernel for kernel, _ in cupy.calls)
 
 
-def test_bodies_are_not_split_on_a_gpu(cupy):
-    """Their pattern would have to change there."""
-    with pytest.raises(InputError, match="spare: objects are split on a CPU alone"):
-        Simulation.load("deploy/scenes/beam.toml", ["object.beam.effects.cutting.spare=9"], "gpu")
+@pytest.mark.parametrize(
+    ("law", "keys"),
+    [
+        ("corotational", {}),
+        ("neo_hookean", {"solver": {"precision": "mixed"}, "integrator": {"scheme": "newmark", "linearizations": 3}}),
+        ("corotational", {"solver": {"precision": "float32"}, "integrator": {"scheme": "generalized_alpha"}}),
+        ("corotational", {"solver": {"preconditioner": "none"}, "integrator": {"scheme": "central_difference"}}),
+    ],
+    ids=["backward_euler", "newmark", "generalized_alpha", "central_difference"],
+)
+def test_a_body_that_is_split_has_the_arrays_of_one_that_began_so(cupy, law, keys):
+    """At the addresses that it had; copies of nodes begin and splits are noted after the copies of a change."""
+
+    def built(**own):
+        given = cut_table(law, own={"cutting": {"spare": 60, **own}}, **keys)
+        return Simulation(Scene.model_validate(given, context={"folder": "."}), "gpu")
+
+    sim = built()
+    sim.engine.run(2)
+    gpu, pcg = sim.world.backend, sim.engine.solver.params.copy()
+    followed = [a.array for a in sim.world.live_arrays if "cutting" in a.of]
+    twins = [gpu.known_twin(array) for array in followed]
+    before = [None if twin is None else twin.copy() for twin in twins]
+    split(sim, SLIT)
+    assert all(twin is None or np.array_equal(twin, old) for twin, old in zip(twins, before, strict=True))
+    sim.engine.run(1)
+    opened = sim.parameters.scene.objects[0].effects["cutting"].opened
+    other = built(opened=opened)
+    wanted = [other.world.backend.known_twin(a.array) for a in other.world.live_arrays if "cutting" in a.of]
+    for twin, like in zip(twins, wanted, strict=True):
+        assert (twin is None) == (like is None)
+        assert twin is None or (twin.dtype == like.dtype and np.array_equal(twin, like))
+    assert sum(twin is not None and not np.array_equal(twin, old) for twin, old in zip(twins, before, strict=True)) > 5
+    pattern = sim.system.row_start, sim.system.columns
+    lists = [*sim.engine.solver.follow(*pattern)]
+    for array, contents in lists:
+        assert array.dtype == contents.dtype and np.array_equal(array, contents)
+    staged = sim.engine.stage([(each, each.copy()) for each in pattern])[0]
+    copies = {(n, (c.c_char * n).from_address(target)[:]) for target, _, n in staged.copies}
+    wanted = [sim.system.row_start, *(contents for _, contents in lists)]
+    wanted += [own_blocks(*pattern)] if "linearizations" in str(keys) else []
+    assert {(a.nbytes, a.tobytes()) for a in wanted} < copies and len(copies) == len(wanted) + 1, (
+        "and the bodies' numbers"
+    )
+    assert np.array_equal(pcg, sim.engine.solver.params), "graphs keep their addresses"
+    assert {"spawn", "note_splits"} <= {kernel for kernel, _ in cupy.calls}
+    written_back(sim)
 
 
 def test_a_scene_with_attachments_and_springs_alone_is_built(cupy):

@@ -29,7 +29,8 @@ class BadMark(Exception):
 
 def texts() -> list[Path]:
     """The documents that people write: README, CONTRIBUTING and docs, without the pages of benchmarks."""
-    return [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted(DOCS.glob("*.md"))]
+    pages = [path for folder in (DOCS, DOCS / "site", DOCS / "tutorials") for path in sorted(folder.glob("*.md"))]
+    return [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *pages]
 
 
 def cells(line: str) -> list[str]:

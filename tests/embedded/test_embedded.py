@@ -45,6 +45,42 @@ def test_views_are_the_memory_that_steps_write(simulation):
     np.testing.assert_array_equal(mine, simulation.x)
 
 
+def test_views_are_shared_by_dlpack(simulation):
+    """So that PyTorch and others see what steps write, and write what steps read."""
+    theirs = np.from_dlpack(simulation.x)
+    assert np.shares_memory(theirs, simulation.x) and theirs.shape == (12, 3)
+    simulation.step()
+    np.testing.assert_array_equal(theirs, simulation.x)
+
+
+def test_an_object_goes_back_alone():
+    """With its pushes; others go on as they are."""
+    scene = falling(wf.Mesh(GRID.rest, GRID.tets))
+    scene["object"].append({**scene["object"][0], "name": "other", "pose": {"translate": [1, 0, 0]}})
+    with wf.Simulation(scene) as two:
+        start = two.x.copy()
+        for name in two.objects:
+            two.push(name, "top", (0, 0, 5), duration=10)
+        two.step(5)
+        moved = two.positions("other").copy()
+        two.reset("cube")
+        np.testing.assert_array_equal(two.positions("cube"), start[:12])
+        np.testing.assert_array_equal(two.positions("other"), moved)
+        assert (two.velocities("cube") == 0).all() and (two.displacements("cube") == 0).all()
+        two.step(5)
+        assert abs(two.velocities("cube")[:, 2]).max() < 1e-6 < two.velocities("other")[:, 2].mean()
+        two.reset()
+        np.testing.assert_array_equal(two.x, start)
+
+
+def test_displacements_and_tip():
+    with wf.Simulation(falling(wf.Mesh(GRID.rest, GRID.tets), fixed={"where": "Z < 0.01"})) as bent:
+        bent.step(5)
+        moved = bent.displacements("cube")
+        np.testing.assert_array_equal(moved, bent.x - GRID.rest)
+        assert GRID.rest[bent.tip("cube"), 2] == 0.2 and moved[bent.tip("cube"), 1] < -1e-4
+
+
 def test_a_reset_repeats_the_run(simulation):
     """To what solves leave: factors are kept, and are others the second time."""
     runs = []

@@ -214,6 +214,9 @@ def test_one_region_is_set_by_its_name(organ):
     at_start = load(organ / "scene.toml", ["object.liver.effects.corotational.young[tumour]=3e4"])
     sim = Simulation(at_start)
     assert np.array_equal(sim.effects["corotational"].elastic[0][0], np.where(LEFT, 3e4, 1e4))
+    assert load(organ / "scene.toml", ["object.liver.effects.corotational.poisson[tumour]=0.1"]).objects[0].effects[
+        "corotational"
+    ].young[0].poisson == pytest.approx(0.1)
     sim.parameters.set({"liver.corotational.young[tumour]": "5e4"})
     assert np.array_equal(sim.effects["corotational"].elastic[0][0], np.where(LEFT, 5e4, 1e4))
     assert list(sim.parameters.changed) == ["object.liver.effects.corotational.young"]

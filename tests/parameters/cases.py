@@ -12,6 +12,7 @@ import numpy as np
 
 from sim_server.parameters import toml
 from sim_server.scene.model import Scene
+from sim_server.scene.overrides import assign
 from sim_server.simulation import Simulation
 from tests.effects.hollow import INSIDE, box
 from tests.scenes import mesh_file
@@ -20,6 +21,7 @@ from tests.state import put
 FIXED = {"fixed": {"where": "X < 0.01"}}
 BAR = {"bar": [3, 1, 1], "size": [1.5, 0.5, 0.5], "split": "kuhn"}
 REGIONS = [{"where": "X < 0.7", "young": 2e5}, {"young": 5e4, "poisson": 0.2}]
+NAMED = [{"where": "X < 0.7", "young": 2e5, "name": "tumour"}, {"young": 5e4, "poisson": 0.2, "name": "rest"}]
 YOUNG = {"young": 1e5, "poisson": 0.3}
 STRETCHED = {"direction": [[1, 0, 0], [0, 1, 0]]}
 LOADS = {"where": "X > 1.49", "force": [0, 30, 0], "stress": [5, 0, 0], "pressure": 40.0, "moment": [0, 9, 3]}
@@ -60,6 +62,8 @@ CASES = {
     "exact": law("corotational", YOUNG | {"tangent": "exact"}, young=4e5),
     "qr": law("corotational", YOUNG | {"rotation": "qr"}, young=4e5),
     "regions": law("corotational", YOUNG | {"young": REGIONS}, young=[REGIONS[0], {"young": 3e5}]),
+    "a region": law("corotational", YOUNG | {"young": NAMED}, **{"poisson[tumour]": 0.45, "young[tumour]": 4e5}),
+    "a region of a law": law("neo_hookean", YOUNG | {"young": NAMED}, **{"poisson[rest]": 0.45}),
     "springs": law("mass_spring", SPRINGS, stiffness=500.0, rest_length=0.3),
     "edges": law("mass_spring", {"young": 1e5}, young=2e4),
     "st_venant_kirchhoff": law("st_venant_kirchhoff", YOUNG, young=3e5, poisson=0.2),
@@ -187,7 +191,7 @@ def with_values(case: Case) -> dict[str, Any]:
         tables = {t["name"]: t for kind in ("object", "obstacle") for t in scene.get(kind, [])}
         inside = tables.get(name, {"effects": {name: scene["effects"].get(name)}})
         path = path if name in tables else [name, *path]
-        (inside["effects"][path[0]] if len(path) == 2 else inside)[path[-1]] = value
+        assign(path[-1], value, "", inside["effects"][path[0]] if len(path) == 2 else inside)
     return scene
 
 

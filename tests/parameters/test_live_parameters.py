@@ -10,6 +10,7 @@ from sim_server.effects import effect, known_effects
 from sim_server.parameters import BadParameter
 from sim_server.scene.live import Live, live_fields
 from sim_server.scene.model import Scene
+from sim_server.scene.overrides import region_of
 from sim_server.simulation import Simulation
 from tests.parameters.cases import CASES, both, same, table
 from tests.scenes import bar, simulation
@@ -40,7 +41,8 @@ def unchanged(case):
 def test_every_live_parameter_has_a_case():
     fields = chain.from_iterable(live_fields(Scene.model_validate(table(case))) for case in CASES.values())
     short = {f.short: f for f in fields}
-    tried = {(short[key].of, key.rpartition(".")[2]) for case in CASES.values() for key in case.values}
+    keys = {key for case in CASES.values() for key in case.values if not region_of(key)[1]}
+    tried = {(short[key].of, key.rpartition(".")[2]) for key in keys}
     marked = {
         (name, key)
         for name in known_effects()
@@ -107,12 +109,16 @@ REFUSED = {
     "bar.fixed.where": ("'X < 1'", "cannot change while steps run"),
     "other.corotational.young": ("1e5", "is a list of 2 regions in the scene"),
     "other.corotational.poisson": ("[0.2]", "must be a number"),
+    "other.corotational.poisson[tumour]": ("0.5", "poisson = 0.5: must be less than 0.5"),
+    "other.corotational.poisson[tumor]": ("0.4", "poisson has no region 'tumor'; did you mean 'tumour'?"),
+    "other.corotational.colour[tumour]": ("0.4", "colour = 0.4: unknown key"),
+    "bar.corotational.poisson[tumour]": ("0.4", "poisson has no region 'tumour'"),
 }
 
 
 @pytest.fixture(scope="module")
 def two_bars():
-    regions = [{"where": "X < 1", "young": 1e5}, {"young": 2e5}]
+    regions = [{"where": "X < 1", "young": 1e5, "name": "tumour"}, {"young": 2e5}]
     damped = bar((2, 1, 1), fixed="X < 0.01", damping=(0.0, 0.01))
     return simulation(damped, bar((2, 1, 1), name="other", young=regions), gravity=(0, -9.81, 0))
 
@@ -140,6 +146,23 @@ def test_damping_of_the_stiffness_is_refused_where_stages_have_no_kernel_for_it(
 def test_regions_are_refused_where_an_element_is_in_none(two_bars):
     with pytest.raises(BadParameter, match="is in no region of young"):
         two_bars.parameters.set({"other.corotational.young": '[{ where = "X < 1", young = 1e5 }]'})
+
+
+def test_a_constant_of_a_region_is_set_by_its_name():
+    """Others of the same list in the same command, too; the log is told of the whole list."""
+    regions = [{"where": "X < 1", "young": 1e5, "name": "tumour"}, {"young": 2e5, "poisson": 0.1}]
+    sim, given = simulation(bar((2, 1, 1), young=regions)), []
+    sim.parameters.on_set.append(given.append)
+    sim.parameters.set({"bar.corotational.poisson[tumour]": "0.45", "bar.corotational.young[tumour]": "3e5"})
+    sim.engine.run(1)
+    young, poisson = sim.effects["corotational"].elastic[0]
+    here = sim.world.bodies[0].centroids[:, 0] < 1
+    assert (young == np.where(here, 3e5, 2e5)).all() and (poisson == np.where(here, 0.45, 0.1)).all()
+    assert list(given[0].values) == ["object.bar.effects.corotational.young"] and given[0].taken == 0
+    whole = given[0].values["object.bar.effects.corotational.young"]
+    for twice in ({"young": whole, "poisson[tumour]": "0.2"}, {"poisson[tumour]": "0.2", "young": whole}):
+        with pytest.raises(BadParameter, match="is set twice"):
+            sim.parameters.set({f"bar.corotational.{key}": value for key, value in twice.items()})
 
 
 def test_parameters_are_listed_with_units_bounds_and_meaning(two_bars):

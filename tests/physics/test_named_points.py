@@ -3,6 +3,7 @@
 
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 
 from sim_server.mechanics.named_points import NAMES, NamedPoints
 from sim_server.mechanics.world import World
@@ -55,6 +56,20 @@ def test_sides_are_free_nodes_as_the_body_lies_now() -> None:
     assert found.named("bottom")[1] > 7.0, "its lowest nodes are fixed"
     assert found.box() == ((7.0, 7.0, 7.0), (8.0, 9.0, 8.0))
     assert found.distance((7.5, 8.0, 7.5)) == 0 and found.distance((10.0, 8.0, 8.0)) == 2.0
+
+
+def test_the_tip_is_where_it_is_once_it_was_found(monkeypatch: pytest.MonkeyPatch) -> None:
+    """To find it takes time at the first use, in which a body of a server moves on."""
+    w = world(fixed="X < 0.01")
+    found = points(w)
+    search = cKDTree.query
+
+    def slow(self: cKDTree, at: np.ndarray) -> object:
+        w.x += [0.0, 5.0, 0.0]
+        return search(self, at)
+
+    monkeypatch.setattr("scipy.spatial.cKDTree", type("Slow", (cKDTree,), {"query": slow}))
+    assert found.named("tip")[1] >= 5.0
 
 
 def test_other_names_are_refused() -> None:

@@ -50,6 +50,8 @@ def test_what_needs_an_extra_names_it() -> None:
     last = found.stderr.splitlines()[-1]
     assert last.startswith("ModuleNotFoundError: warpfactor.Simulation: this needs the package ")
     assert "of the extra server: " in last and "-m pip install " in last
+    last = bare("import warpfactor as wf\nwf.gym").stderr.splitlines()[-1]
+    assert last.startswith("ModuleNotFoundError: warpfactor.gym: this needs the package gymnasium, of the extra gym: ")
     found = bare("sys.argv[1:] = ['gallery/beam']\nfrom sim_server.__main__ import main\nmain()")
     assert found.returncode == 1
     (line,) = found.stderr.splitlines()
@@ -67,7 +69,8 @@ def test_each_extra_lists_packages_and_all_has_those_of_every_machine() -> None:
     """None is this package itself, under a name that no index has; a device and a build from source are not for all."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     extras = project["optional-dependencies"]
-    assert set(extras) == {"server", "mesh", "gpu", "view", "web", "export", "all", "cholmod", "test"}
+    machines = {"server", "mesh", "gpu", "view", "web", "export", "gym", "identify", "all", "cholmod"}
+    assert set(extras) == machines | {"docs", "test"}
     assert not [line for lines in extras.values() for line in lines if line.startswith("warpfactor")]
     assert set(extras["all"]) == {line for name in ("server", "mesh", "view", "web", "export") for line in extras[name]}
     assert set(EXTRAS) <= set(extras)

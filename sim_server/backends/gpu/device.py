@@ -251,6 +251,14 @@ class Gpu:
             twin = self.twin(host)
             twin.set(host.astype(twin.dtype, copy=False))
 
+    def view(self, host: NDArray[Any]) -> DeviceArray:
+        """Returns the twin."""
+        return self.twin(host)
+
+    def settle(self) -> None:
+        """Waits for all streams of the device."""
+        self.cp.cuda.runtime.deviceSynchronize()
+
     def engine(self, given: EngineInput) -> Engine:
         """Returns the loop over launches of this backend."""
         from sim_server.backends.gpu.engine import GpuEngine

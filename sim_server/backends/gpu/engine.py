@@ -34,6 +34,7 @@ from sim_server.backends.gpu.measured import MeasuredReport
 from sim_server.backends.gpu.newton import NewtonIteration, NewtonPhases, begins_beside
 from sim_server.backends.gpu.rosenbrock import ATTEMPTS, RosenbrockStep
 from sim_server.backends.gpu.solver import PCG_BODY, PCG_RESULT, SETTINGS_BYTES, PcgSolver
+from sim_server.backends.gpu.splits import DeviceSplits, Staged
 from sim_server.backends.gpu.state import device_array, device_arrays
 from sim_server.backends.gpu.structs import (
     CONTACT_RESULT,
@@ -121,6 +122,7 @@ class GpuEngine(DeviceLoop):
         self._forces = fuse(forces) if alone else ()  # after a whole assembly, whose energy balance is made already
         phases = NewtonPhases.initial(gpu, bodies) if newton else None
         correction = self._correction = FactorCorrection.wanted(gpu, given)
+        most_blocks = given.cut.most_blocks if given.cut else ()
         surfaces = given.contact.surfaces if given.contact else None
         self._rows_of_bodies: tuple[NDArray[Any], ...] = (
             (given.contact.corner, given.contact.weight) if given.contact and surfaces else ()
@@ -131,7 +133,7 @@ class GpuEngine(DeviceLoop):
             phases.of_solves(errors) if phases else (), ATTEMPTS if stages else 0,
             given.contact is not None,
             given.contact is not None and bool(given.contact.surfaces or given.contact.ties), correction, errors,
-            budgets,
+            budgets, most_blocks,
         )  # fmt: skip
         self._newton, newton_results = None, None
         if newton and phases:
@@ -141,6 +143,9 @@ class GpuEngine(DeviceLoop):
             self._newton = NewtonIteration(
                 gpu, device, newton, assemble, ranges, arrays, phases, self.solver, newton_results, settled, search
             )  # fmt: skip
+        self._splits: DeviceSplits | None = None
+        if most_blocks:
+            self._splits = DeviceSplits(gpu, given, self.solver, self._newton, self._counter)
         self._contact, contact_results, reactions, told = None, None, None, None
         self._ties = given.contact.ties if given.contact else None
         if given.contact:
@@ -191,7 +196,7 @@ class GpuEngine(DeviceLoop):
         super().__init__(
             device, ranges, arrays["row_start"], dt, mailboxes, self._results, self._timestamps, arrays["clock"],
             records, twins["values"].dtype, newton_results, energy_records, stage_results,
-            contact_results, reactions, held, substep_results, **addresses,
+            contact_results, reactions, held, substep_results, most_blocks, **addresses,
         )  # fmt: skip
         if told:
             self.report_pairs(*told)
@@ -271,7 +276,7 @@ class GpuEngine(DeviceLoop):
 
     def state(self) -> list[StateArray]:
         """Returns what the device carries on beside the arrays that launches write."""
-        parts = (self._energies, self._stages, self._substeps, self._contact, self._correction)
+        parts = (self._energies, self._stages, self._substeps, self._contact, self._correction, self._splits)
         clock = self.gpu.twin(self._arrays["clock"])
         found = [device_array("engine.clock", clock), *(a for part in parts if part for a in part.state())]
         if self._rows_of_bodies:
@@ -480,41 +485,50 @@ class GpuEngine(DeviceLoop):
         self.gpu.cp.cuda.get_current_stream().synchronize()  # its arrays are complete
         return self.mailboxes[self._mailed[launch]].post(cast(DeviceLaunch, new).params.tobytes(), keep=new)
 
-    def stage(self, changes: Sequence[ArrayChange]) -> list[tuple[int, int, int, Any] | None]:
-        """Copies new contents to the device beside the arrays: target, source, bytes, memory; None: no kernel has it.
+    def stage(self, changes: Sequence[ArrayChange]) -> list[Staged | None]:
+        """Copies new contents to the device beside the arrays; None: no kernel has the array.
 
         Arrays of the host have them at once.
         """
-        cp, staged = self.gpu.cp, list[tuple[int, int, int, Any] | None]()
-        for host, contents in changes:
-            if (twin := self.gpu.known_twin(host)) is None:
-                staged.append(None)
-                continue
-            made = cp.asarray(contents.astype(twin.dtype))
-            staged.append((int(twin.data.ptr), int(made.data.ptr), int(twin.nbytes), made))
-        if not self._work_graphs:  # in a stream of their own: steps are under way
-            self._energies.prepare_work()
-            self._estimate_now = cp.asarray(np.array([ESTIMATE_EVERY], np.int32))
-            stream = cp.cuda.Stream(non_blocking=True)
-            graphs = []
-            for after in (False, True):
-                with stream:
-                    stream.begin_capture()
-                    self._energies.launch_work(after)
-                    graphs.append(stream.end_capture())
-            self._work_graphs = graphs
-        cp.cuda.get_current_stream().synchronize()  # what is copied is complete
+        twins = [(self.gpu.known_twin(host), contents) for host, contents in changes]
+        staged = [None if twin is None else Staged.of(self.gpu, [(twin, new)]) for twin, new in twins]
+        if self._splits and (followed := self._splits.stage(changes)):
+            rows = next(k for k, (host, _) in enumerate(changes) if host is self._arrays["row_start"])
+            own = cast(Staged, staged[rows])
+            staged[rows] = Staged([*own.copies, *followed.copies], (own.keep, followed.keep), followed.places)
+        if not self._work_graphs:
+            self._prepare_changes()
+        self.gpu.cp.cuda.get_current_stream().synchronize()  # what is copied is complete
         for host, contents in changes:
             host[...] = contents
         return staged
 
-    def change(self, changes: Sequence[tuple[int, int, int, Any] | None]) -> DeviceChanges:
+    def _prepare_changes(self) -> None:
+        """Captures what is launched before and after the copies of a change, in a stream of its own: steps are under
+        way."""
+        cp = self.gpu.cp
+        self._energies.prepare_work()
+        self._estimate_now = cp.asarray(np.array([ESTIMATE_EVERY], np.int32))
+        stream = cp.cuda.Stream(non_blocking=True)
+        graphs = []
+        for after in (False, True):
+            with stream:
+                stream.begin_capture()
+                if after and self._splits:
+                    self._splits.launch()
+                self._energies.launch_work(after)
+                graphs.append(stream.end_capture())
+        self._work_graphs = graphs
+
+    def change(self, changes: Sequence[Staged | None]) -> DeviceChanges:
         """Copies new contents into the twins of arrays between two batches: those after the result's `taken` steps."""
-        copies = [each[:3] for each in changes if each is not None]
+        made = [each for each in changes if each is not None]
+        copies = [copy for each in made for copy in each.copies]
+        places = next((each.places for each in made if each.places is not None), None)
         if self._substeps:
             copies.append((self._substeps.since, int(self._estimate_now.data.ptr), 4))
         before, after = (int(graph.graphExec) for graph in self._work_graphs)
-        return self._changes.post(copies, before, after, (changes, self._estimate_now))
+        return self._changes.post(copies, before, after, (changes, self._estimate_now), places)
 
     def take_changes(self) -> None:
         """Copies what waits at once, while the loop stands still."""

@@ -153,6 +153,8 @@ class FactorUpload:
             for old in [k for k in uploads.storages if k != in_use]:
                 if len(uploads.storages) >= MAX_PATTERNS:
                     del uploads.storages[old]
+            kept = {each for other in self._uploads for each in other.storages}
+            self._solver.forget_plans({*kept, pattern.id})
         storages = uploads.storages.setdefault(pattern.id, [])
         used = uploads.in_use.storage if uploads.in_use else None
         storage = next((s for s in storages if s is not used), None)

@@ -40,6 +40,10 @@ static bool take_changes(GpuLoop& l) {
     CALL(graph_launch, next->before, l.stream);
     for (int64_t i = 0; i < next->count; ++i)
         CALL(on_device, next->copies[i].target, next->copies[i].source, (size_t)next->copies[i].bytes, l.stream);
+    for (int i = 0; next->places && i < l.bodies; ++i) {
+        l.readbacks[i].values_begin = next->places[2 * i];
+        l.readbacks[i].values_bytes = next->places[2 * i + 1];
+    }
     CALL(graph_launch, next->after, l.stream);
     next->taken.store(l.launched, std::memory_order_release);
     return true;

@@ -45,6 +45,7 @@ struct DeviceCopy {             // new contents of an array on the device
 
 struct DeviceChanges {          // of parameters: copies that are made between the same two steps
     const DeviceCopy* copies;
+    const int64_t* places;       // (bodies, 2) values_begin and values_bytes of each body from then on; null: as before
     void *before, *after;        // graphs that make work of the elastic energy that they add
     int64_t count;
     std::atomic<int64_t> taken;  // steps launched before them, -1: not yet
@@ -54,6 +55,7 @@ enum Request { REQUEST_VALUES = 1, REQUEST_POSITIONS = 2 };
 
 struct BodyReadback {                    // copies of a body's matrix or positions to the host
     int64_t values_begin, values_bytes;  // its blocks among the values of A
+    int64_t staged_begin;                // its place in the memory for copies, where bodies that are split have room for more
     int64_t x_begin, x_bytes;            // its nodes in x
     std::atomic<int32_t> requested;      // REQUEST_VALUES, REQUEST_POSITIONS or 0
     int32_t in_flight;                   // the same, of the copy under way

@@ -74,6 +74,8 @@ class DeviceLoop(Reports):
     clock: host array (1,), time of the simulation [s]
     records: capacity of the ring of records
     real: type of values, x and v on the device
+    most_blocks: of A of each body, however it is split (`places` of mailbox.ChangeMailbox.post); none: those of
+        row_start, which stay
     addresses: device addresses of values, x and v, and with contact poses (obstacles, 7) of float64
     """
 
@@ -83,7 +85,8 @@ class DeviceLoop(Reports):
         records: int = 8192, real: DTypeLike = np.float64, newton_results: NDArray[Any] | None = None,
         energy_records: NDArray[Any] | None = None, stage_results: NDArray[Any] | None = None,
         contact_results: NDArray[Any] | None = None, contact_reactions: NDArray[Any] | None = None,
-        held_reactions: NDArray[Any] | None = None, substep_results: NDArray[Any] | None = None, **addresses: int,
+        held_reactions: NDArray[Any] | None = None, substep_results: NDArray[Any] | None = None,
+        most_blocks: Sequence[int] = (), **addresses: int,
     ):  # fmt: skip
         self._device, self._ranges, bodies, nodes = device, ranges, len(ranges), len(row_start) - 1
         self._native = library()
@@ -96,11 +99,15 @@ class DeviceLoop(Reports):
             slot.target, slot.size = target, size
         self.mailboxes = [DeviceMailbox(loop, slot) for slot in self._slots]
         self._readbacks, block = (structs.BodyReadback * bodies)(), 9 * np.dtype(real).itemsize
-        for entry, (first, last) in zip(self._readbacks, ranges, strict=True):
+        most = most_blocks or [int(row_start[last] - row_start[first]) for first, last in ranges]
+        self._room = [block * count for count in most]  # bytes of the blocks of each body at most
+        staged = np.cumsum([0, *self._room])
+        for entry, (first, last), own in zip(self._readbacks, ranges, staged, strict=False):
             begin, end = block * int(row_start[first]), block * int(row_start[last])
             entry.values_begin, entry.values_bytes, entry.copied_step = begin, end - begin, -1
+            entry.staged_begin = int(own)
             entry.x_begin, entry.x_bytes = (3 * np.dtype(real).itemsize * k for k in (first, last - first))
-        self._real, self._value_bytes = np.dtype(real), block * int(row_start[-1])
+        self._real, self._value_bytes = np.dtype(real), int(staged[-1])
         self._targets: dict[int, Float64] = {}
         self._requested_bytes: dict[int, int] = {}  # by body
         loop.driver = c.addressof(device.functions)
@@ -223,7 +230,11 @@ class DeviceLoop(Reports):
     # --- matrices -----------------------------------------------------------------------------------------------
 
     def request_matrix(self, body: int, target: Float64) -> None:
-        """Copies the values of A of the next step into `target`; complete once `matrix_step` returns a step."""
+        """Copies the values of A of the next step into `target`; complete once `matrix_step` returns a step.
+
+        target: (blocks, 3, 3), with room for all blocks that the body may have; what is behind those of that step has
+        no meaning
+        """
         self._request(body, target, structs.REQUEST_VALUES)
 
     def request_positions(self, body: int, target: Float64, ahead: float = 0.0) -> None:
@@ -240,7 +251,7 @@ class DeviceLoop(Reports):
         self._targets[body] = target
         entry = self._readbacks[body]
         entry.copied_step, entry.requested = -1, request
-        self._requested_bytes[body] = entry.values_bytes if request == structs.REQUEST_VALUES else entry.x_bytes
+        self._requested_bytes[body] = self._room[body] if request == structs.REQUEST_VALUES else entry.x_bytes
         self.loop.requested = 1
 
     def matrix_step(self, body: int) -> int:
@@ -248,7 +259,7 @@ class DeviceLoop(Reports):
         entry = self._readbacks[body]
         step = int(entry.copied_step)
         if step >= 0 and body in self._targets:
-            data = self._pinned_values[entry.values_begin : entry.values_begin + self._requested_bytes[body]]
+            data = self._pinned_values[entry.staged_begin : entry.staged_begin + self._requested_bytes[body]]
             target = self._targets.pop(body)
             target[...] = data.view(self._real).reshape(target.shape)
         return step

@@ -6,6 +6,9 @@ from collections.abc import Sequence
 from functools import cache
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from sim_server.backends.compiler import native
 from sim_server.backends.gpu import structs
 
@@ -39,17 +42,23 @@ class ChangeMailbox:
         self._kept: list[tuple[structs.DeviceChanges, Any]] = []
 
     def post(
-        self, copies: Sequence[tuple[int, int, int]], before: int, after: int, keep: Any = None
-    ) -> structs.DeviceChanges:
+        self, copies: Sequence[tuple[int, int, int]], before: int, after: int, keep: Any = None,
+        places: NDArray[np.int64] | None = None,
+    ) -> structs.DeviceChanges:  # fmt: skip
         """Posts copies: device addresses of target and source, and bytes. Nothing else may wait (`withdraw`).
 
         before, after: handles of graphs that are launched around them. keep: objects that own the memory.
+        places: (bodies, 2), where the blocks of each body begin among the values of A from then on, and their bytes;
+        None: as before.
         The contents are valid from the step after the result's `taken` steps, once that is not below 0.
         """
         native = (structs.DeviceCopy * max(len(copies), 1))(*(structs.DeviceCopy(*each) for each in copies))
-        made = structs.DeviceChanges(c.addressof(native), before, after, len(copies), -1)
+        at = None if places is None else places.ctypes.data
+        made = structs.DeviceChanges(
+            copies=c.addressof(native), places=at, before=before, after=after, count=len(copies), taken=-1
+        )
         self._kept = [each for each in self._kept if not 0 <= each[0].taken < self._loop.step]
-        self._kept.append((made, (native, keep)))
+        self._kept.append((made, (native, places, keep)))
         library().wf_gpu_post_changes(c.byref(self._loop), c.addressof(made))
         return made
 

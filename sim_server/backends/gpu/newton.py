@@ -92,9 +92,12 @@ def node_ranges(ranges: Int64) -> NDArray[Any]:
 
 
 def own_blocks(row_start: Int32, columns: Int32) -> Int32:
-    """Returns the place of each node's own block, (nodes,); -1 at fixed nodes, whose rows have no other."""
+    """Returns the place of each node's own block, (nodes,); -1 at fixed nodes, whose rows have no other.
+
+    columns: with any room behind the last row
+    """
     rows = np.repeat(np.arange(len(row_start) - 1), np.diff(row_start))
-    places = np.flatnonzero(columns == rows)
+    places = np.flatnonzero(columns[: len(rows)] == rows)
     return np.where(np.diff(row_start) > 1, places, -1).astype(np.int32)
 
 
@@ -209,6 +212,10 @@ class NewtonIteration:
         forces = [launch for launch in again if launch.domain != "blocks"]
         made = fuse(forces, guard, readers=[*blocks, *readers])
         return made, fuse(blocks, guard, readers=[*forces, *readers])
+
+    def follow(self, row_start: Int32, columns: Int32) -> tuple[DeviceArray, Int32]:
+        """Returns the array that follows the pattern of A, and its contents for this one."""
+        return self._memory["diagonal"], own_blocks(row_start, columns)
 
     def launch(self) -> None:
         """Launches the whole iteration of a step whose first linearization has been assembled.

@@ -864,6 +864,10 @@ __device__ __forceinline__ void solve_body(const PcgArguments& s, const RowRange
     const int k = range.body;
     for (int i = threadIdx.x; i < (int)(sizeof(PcgBody) / 4); i += THREADS) ((int*)&memory.body)[i] = ((const int*)(s.bodies + k))[i];
     if (threadIdx.x == THREADS - 1) memory.rests = s.moving[k] == 0;
+#ifdef SPLITS
+    __syncthreads();
+    if (threadIdx.x == 0 && memory.body.factor_step < s.split_step[k]) memory.body.plan = nullptr;  // of another pattern
+#endif
 #ifdef CONTACT_PASSES
     if (threadIdx.x == 0) memory.contact = pass.state[k];
 #endif

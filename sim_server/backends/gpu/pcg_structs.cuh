@@ -98,5 +98,6 @@ struct PcgArguments {
     const long long* begun;        // (1,) time at which the step began [ns]
     TrialClock* clocks;            // (bodies,)
     const int* moving;             // (bodies,) 0: the body rests (kernels/nodes.cu)
+    const long long* split_step;   // -DSPLITS: (bodies,) steps completed when the body was split last: older factors are not used
     int nodes, shared;             // of the scene; bytes of dynamic shared memory
 };

@@ -26,7 +26,7 @@ static bool begin_matrices(GpuLoop& l, bool before) {
         if (before && !any) CALL(graph_launch, l.matrix, l.stream);
         any = true;
         Address from = request == REQUEST_VALUES ? l.values + body.values_begin : l.x + body.x_begin;
-        CALL(on_device, l.staged + body.values_begin, from, (size_t)readback_bytes(body), l.stream);
+        CALL(on_device, l.staged + body.staged_begin, from, (size_t)readback_bytes(body), l.stream);
     }
     if (others) l.requested.store(1, std::memory_order_release);
     if (!any) return true;
@@ -35,7 +35,7 @@ static bool begin_matrices(GpuLoop& l, bool before) {
     for (int i = 0; i < l.bodies; ++i) {
         BodyReadback& body = l.readbacks[i];
         if (body.in_flight)
-            CALL(to_host, l.host_matrices + body.values_begin, l.staged + body.values_begin, (size_t)readback_bytes(body), l.copy_stream);
+            CALL(to_host, l.host_matrices + body.staged_begin, l.staged + body.staged_begin, (size_t)readback_bytes(body), l.copy_stream);
     }
     CALL(event_record, l.copied_event, l.copy_stream);
     l.matrix_step = before ? l.launched.load() : l.launched - 1;  // steps completed before the matrix was assembled; positions are those after that step

@@ -140,6 +140,12 @@ def halo(ranges: Int64, count: Int64, row_start: Int32, columns: Int32) -> Halo:
     return Halo(table, nodes - np.repeat(origin, np.diff(start)), local, first)
 
 
+def lists_of(partition: Halo) -> dict[str, NDArray[np.int32]]:
+    """Returns the arrays of the solver by their names in PcgArguments."""
+    ranges, nodes, local = partition.ranges.view(np.int32), partition.nodes, partition.local
+    return {"row_ranges": ranges, "halo": nodes.astype(np.int32), "local_column": local.astype(np.int32)}
+
+
 def initial_ranges(assigned: BlockAssignment, partition: Halo, grid: int) -> Int32:
     """Returns the range with which each thread block of the grid begins, -1 where it takes one of the pool."""
     found = np.full(grid, -1, np.int32)

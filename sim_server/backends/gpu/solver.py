@@ -1,22 +1,23 @@
 # SPDX-License-Identifier: MIT
 """Memory and launch of the persistent conjugate gradient kernel (pcg.cu)."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from protocol.factor import FactorPattern
-from sim_server.arrays import Int64
+from sim_server.arrays import Int32, Int64
 from sim_server.backends.compiler import SOURCES
 from sim_server.backends.gpu.correction import FactorCorrection
 from sim_server.backends.gpu.cupy_types import DeviceArray, KernelFunction
 from sim_server.backends.gpu.device import Gpu, compiled, options, own_headers
+from sim_server.backends.gpu.followed_rows import FollowedRows
 from sim_server.backends.gpu.inverse.build_inverse import InverseBuilder, PartitionedInverse
 from sim_server.backends.gpu.inverse.device_plan import DevicePlan, shared_bytes
 from sim_server.backends.gpu.inverse.plan import plan
-from sim_server.backends.gpu.row_partition import SPARED, best_assignment, halo, initial_ranges
+from sim_server.backends.gpu.row_partition import SPARED, best_assignment, halo, initial_ranges, lists_of
 from sim_server.backends.gpu.structs import CONTACT, CORRECTION, PCG, PCG_RESULT, STAGES
 
 PCG_BODY = PCG.dtype("PcgBody")
@@ -47,7 +48,9 @@ class PcgSolver:
     correction: of factors for grabs and contacts; None: they are not corrected
     errors: True for a scene whose solves estimate the errors of positions (iterate_error.cuh)
     budgets: True for a scene whose solves may end by their wall time (step_budget.cuh); they estimate errors, too
+    most_blocks: of A of each body, where bodies may be split while steps run; none: the pattern of A stays
 
+    followed: what follows the pattern of A then (`follow`), else None
     params: arguments of the kernel (PCG_ARGUMENTS)
     bodies: host rows (PCG_BODY), one per body. The loop uploads the settings (the first SETTINGS_BYTES bytes of a row)
         and the factor (the others) separately.
@@ -60,6 +63,7 @@ class PcgSolver:
         self, gpu: Gpu, ranges: Sequence[tuple[int, int]], arrays: Mapping[str, NDArray[Any]], counter: DeviceArray,
         capacity: int, planes: int = 1, phases: Sequence[DeviceArray] = (), attempts: int = 0, contact: bool = False,
         between: bool = False, correction: FactorCorrection | None = None, errors: bool = False, budgets: bool = False,
+        most_blocks: Sequence[int] = (),
     ):  # fmt: skip
         cp, processors = gpu.cp, gpu.properties["multiProcessorCount"]
         self.gpu, self.counter, self._capacity, self.planes, self._phases = gpu, counter, capacity, planes, phases
@@ -79,18 +83,23 @@ class PcgSolver:
         self.bodies = np.zeros(len(ranges), PCG_BODY)
         self.bodies["first"], self.bodies["nodes"] = spans[:, 0], nodes
         self.bodies["blocks"] = assigned.blocks
-        partition = halo(spans, assigned.blocks, arrays["row_start"], arrays["columns"])
+        pattern = arrays["row_start"], arrays["columns"]
+        self.followed = FollowedRows(spans, assigned.blocks, most_blocks) if most_blocks else None
+        if self.followed:
+            partition, lists, read = self.followed.partition(*pattern), self.followed.of(*pattern), self.followed.halo
+        else:
+            partition = halo(spans, assigned.blocks, *pattern)
+            lists, read = lists_of(partition), len(partition.nodes)
         self.bodies["first_range"] = partition.first
         self._rows = cp.zeros(self.bodies.nbytes, np.uint8)
         self.results: DeviceArray = cp.zeros(capacity * len(ranges) * PCG_RESULT.itemsize, np.uint8)
         self.pool_counter: DeviceArray = cp.zeros(max(attempts, 1), np.uint32)
         total, ints = len(arrays["row_start"]) - 1, np.int32
         self._work: dict[str, DeviceArray] = {
-            "order": cp.asarray(assigned.order.astype(ints)), "row_ranges": cp.asarray(partition.ranges.view(ints)),
+            "order": cp.asarray(assigned.order.astype(ints)),
             "initial_range": cp.asarray(initial_ranges(assigned, partition, self.grid)),
-            "halo": cp.asarray(partition.nodes.astype(ints)), "local_column": cp.asarray(partition.local.astype(ints)),
-            "halo_values": cp.zeros(3 * len(partition.nodes), self.real),
-            "halo_position": cp.zeros(len(partition.nodes), ints),
+            **{name: cp.asarray(array) for name, array in lists.items()},
+            "halo_values": cp.zeros(3 * read, self.real), "halo_position": cp.zeros(read, ints),
             "own_vectors": cp.zeros((12 if errors else 9) * total, self.real),
             "z": cp.zeros(6 * total), "diagonal": cp.zeros(9 * total, self.real),
             "block_sums": cp.zeros((20 if errors else 16) * self.grid * len(ranges)),
@@ -98,6 +107,8 @@ class PcgSolver:
             "pool_counter": self.pool_counter, "results": self.results, "step": counter,
             "begun": cp.zeros(1, np.int64), "clocks": cp.zeros(len(ranges) * TRIAL_CLOCK.itemsize, np.uint8),
         }  # fmt: skip
+        if self.followed:
+            self._work["split_step"] = cp.zeros(len(ranges), np.int64)
         fixed = 5120 if correction else 2048  # bytes: shared memory that pcg.cu declares, and the driver's
         self._shared = (gpu.properties["sharedMemPerMultiprocessor"] // blocks - fixed - 1024) // 16 * 16
         self.params = self._arguments(total, assigned.pooled)
@@ -124,6 +135,24 @@ class PcgSolver:
         """Wall times of the searches of the bodies (TRIAL_CLOCK)."""
         return self._work["clocks"]
 
+    @property
+    def split_step(self) -> DeviceArray:
+        """Steps completed when each body was split last, (bodies,); there only where bodies may be split."""
+        return self._work["split_step"]
+
+    def follow(self, row_start: Int32, columns: Int32) -> list[tuple[DeviceArray, NDArray[Any]]]:
+        """Returns the arrays that follow the pattern of A, and their contents for this one."""
+        assert self.followed is not None
+        return [(self._work[name], array) for name, array in self.followed.of(row_start, columns).items()]
+
+    def forget_plans(self, patterns: Collection[int]) -> None:
+        """Frees plans of factors of all but these patterns (FactorPattern.id), which no step may use any more."""
+        gone = [key for key in self._plans if key[0] not in patterns]
+        addresses = {self._plans[key].address for key in gone}
+        for key in gone:
+            del self._plans[key], self._builders[key]
+        self._vectors = {key: made for key, made in self._vectors.items() if key[1] not in addresses}
+
     def _compiled(self, name: str, blocks: int) -> KernelFunction:
         """Compiles the kernel of the text <name>.cu for `blocks` thread blocks a multiprocessor."""
         declared = STAGES if self._attempts else CONTACT if self._contact else PCG
@@ -138,6 +167,7 @@ class PcgSolver:
                 *(["-DCONTACT_PASSES"] if self._contact else []), *(["-DCORRECTED"] if corrected else []),
                 *(["-DERRORS"] if self.errors and name == "pcg" else []),
                 *(["-DBUDGETS"] if self.budgets and name == "pcg" else []),
+                *(["-DSPLITS"] if self.followed else []),
             ),
             backend="nvrtc",
             enable_cooperative_groups=True,
