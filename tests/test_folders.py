@@ -24,6 +24,7 @@ ALLOWED = {  # what each folder imports of its package
     "clients.demo": {"client", "errors", "load_test", "log"},
     "clients.haptics": {"client", "errors", "obstacle"},
     "clients.log": {"errors"},
+    "clients.identify": {"accuracy", "errors", "log", "plan", "progress"},
     "clients.materials": {"errors"},
     "clients.web": {"client", "errors", "log", "viewer"},
     "clients.viewer": {"client", "errors", "log", "progress"},
