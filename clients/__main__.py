@@ -636,24 +636,28 @@ def web(
 @app.command()
 def export(
     log: Annotated[Path, typer.Argument(metavar="LOG.mcap", help="A recorded run.")],
-    object: Object,
-    to: Annotated[Path, typer.Option(metavar="FILE", help="FILE.npz, FILE.csv or FILE.vtu.")],
+    to: Annotated[Path, typer.Option(metavar="FILE", help="FILE.npz, .csv, .vtu, .vtkhdf, .usdc or .mp4.")],
+    object: Annotated[str | None, typer.Option(metavar="NAME", help="By default all objects.")] = None,
     frame: Annotated[str, typer.Option(help="Of a .vtu: last, a number (0 first, -1 last), or all.")] = "last",
     epoch: Annotated[int | None, typer.Option(help="Of an .npz: which mesh, if cuts changed it.")] = None,
 ) -> None:
-    """Write a log for other programs: .npz (frames and scalars), .csv (scalars), .vtu (ParaView).
+    """Write a log for other programs.
+
+    .npz (NumPy), .csv (scalars), .vtu and .vtkhdf (ParaView), .usdc (Blender), .mp4 (film).
 
     \b
     Examples:
+      sim-client export run.mcap --to run.vtkhdf
+      sim-client export run.mcap --to run.usdc
       sim-client export run.mcap --object beam --to beam.npz
-      sim-client export run.mcap --object beam --to beam.csv
       sim-client export run.mcap --object beam --to beam.vtu --frame all
     """
-    from clients.log.export import export as write
+    from clients.export.export import export as write
     from clients.progress import progress_bar
 
     with _opened(log) as opened:
-        with progress_bar("writing", len(opened.object_log(object).frames)) as progress:
+        chosen = list(opened.objects.values()) if object is None else [opened.object_log(object)]
+        with progress_bar("writing", sum(len(each.frames) for each in chosen)) as progress:
             written = write(opened, object, to, frame, epoch, progress)
         print(f"wrote {written[-1]}" + (f" and {len(written) - 1} more" if len(written) > 1 else ""))
 

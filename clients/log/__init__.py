@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: MIT
-"""A log as arrays: meshes, frames, scalars per step, stresses; and its export to files of other programs."""
+"""A log as arrays: meshes, frames, scalars per step, stresses."""

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass
 from io import BytesIO
 from typing import TYPE_CHECKING
@@ -44,22 +45,33 @@ FRONT = Angle()
 
 
 class Stage:
-    """The frames of a log, drawn from one place. Raises BadInput if the log has none."""
+    """The frames of a log, drawn from one place. names: of the objects in it, None: all. Raises BadInput if the log has
+    none."""
 
-    def __init__(self, log: Log, size: tuple[int, int], angle: Angle = FRONT) -> None:
+    def __init__(
+        self, log: Log, size: tuple[int, int], angle: Angle = FRONT, names: Sequence[str] | None = None
+    ) -> None:
         self._log, self._size = log, size
-        self._names = sorted(name for name, found in log.objects.items() if found.frames)
+        wanted = log.objects if names is None else names
+        self._names = sorted(name for name in wanted if log.object_log(name).frames)
         if not self._names:
             raise BadInput(f"{log.path}: no frames were recorded")
         self._surfaces: dict[str, tuple[int, Surface]] = {}  # object -> epoch and surface of the frame drawn last
         self._times = {name: np.array([f.time for f in log.frames(name)]) for name in self._names}
+        self._scalars = {name: log.scalars(name) for name in self._names}
         self._hands = _hands(log)
         low, high = self._box()
         camera = Camera.around(low, high, angle.azimuth, angle.elevation, size[0] / size[1])
         self._camera = Camera(camera.target + (camera.eye - camera.target) / angle.nearness, camera.target)
         self._floor = float(low[1])
         self._rods = float(np.linalg.norm(high - low)) / 220
-        self._standing = [_standing(o, low, high) for o in log.obstacles.values() if o.name not in log.poses]
+        self._solids = [_solid(o, low, high) for o in log.obstacles.values()]
+        self._poses = {name: np.array([pose.time for pose in poses]) for name, poses in log.poses.items() if poses}
+
+    @property
+    def begin(self) -> float:
+        """Time of the first frame [s]."""
+        return float(min(times[0] for times in self._times.values()))
 
     @property
     def end(self) -> float:
@@ -68,18 +80,28 @@ class Stage:
 
     def draw(self, time: float, caption: bool = True) -> Image:
         """Returns the picture of the frames at a time [s]."""
-        pieces, frames = list(self._standing), {}
+        pieces, frames = [self._placed(solid, time) for solid in self._solids], {}
         for number, name in enumerate(self._names):
             frame = frames[name] = self._frame(name, time)
             surface = self._surface(frame)
             pieces.append(Piece(surface.points(frame.x), surface.triangles, BODIES[number % len(BODIES)]))
         for hand in self._hands.at(max(frame.step for frame in frames.values())):
+            if hand.object not in frames:
+                continue
             held = self._hands.held(hand, frames[hand.object].x)
             target = np.array([hand.target.x, hand.target.y, hand.target.z])
             pieces += [ball(held, 2.5 * self._rods, HAND), rod(held, target, self._rods, HAND)]
             pieces.append(ball(target, 2.5 * self._rods, HAND))
         picture = paint(pieces, self._camera, self._size, self._floor)
         return self._captioned(picture, frames) if caption else picture
+
+    def _placed(self, solid: tuple[Obstacle, Piece], time: float) -> Piece:
+        """Returns an obstacle where it is at a time [s]."""
+        obstacle, piece = solid
+        pose = obstacle.start
+        if obstacle.name in self._poses and time >= self._poses[obstacle.name][0]:
+            pose = self._log.poses[obstacle.name][int(np.abs(self._poses[obstacle.name] - time).argmin())].pose
+        return Piece(piece.x @ pose.matrix().T + pose.position, piece.triangles, piece.color)
 
     def _surface(self, frame: Frame) -> Surface:
         """Returns the surface of the mesh that a frame has."""
@@ -113,7 +135,7 @@ class Stage:
         words = [f"{tets:,} tetrahedra"]
         rows = []
         for name, frame in frames.items():
-            scalars = self._log.scalars(name)
+            scalars = self._scalars[name]
             here = np.flatnonzero(scalars["step"] == frame.step)
             rows += [(scalars["iterations"][here[0]], scalars["factor_age"][here[0]])] if len(here) else []
         if rows:
@@ -127,12 +149,11 @@ class Stage:
         return picture
 
 
-def _standing(obstacle: Obstacle, low: NDArray, high: NDArray) -> Piece:
-    """Returns an obstacle that does not move; a plane has no triangles, since the picture has a floor."""
+def _solid(obstacle: Obstacle, low: NDArray, high: NDArray) -> tuple[Obstacle, Piece]:
+    """Returns an obstacle and its surface in its own frame; a plane has no triangles, since the picture has a floor."""
     vertices, triangles = obstacle_surface(obstacle, low, high)
-    pose = obstacle.start
     shown = triangles[:0] if obstacle.shape == "plane" else triangles
-    return Piece(vertices @ pose.matrix().T + pose.position, shown, np.array(STONE, float))
+    return obstacle, Piece(np.reshape(vertices, (-1, 3)), np.reshape(shown, (-1, 3)), np.array(STONE, float))
 
 
 class _Hands:

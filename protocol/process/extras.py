@@ -13,6 +13,7 @@ EXTRAS = {  # modules of each extra of pyproject.toml; a module of several stand
     "gpu": ("cupy", "cupyx"),
     "view": ("matplotlib", "mpl_toolkits", "PIL", "plotly", "rerun"),
     "web": ("viser", "websockets"),
+    "export": ("foxglove", "h5py", "imageio_ffmpeg", "pxr"),
     "gym": ("gymnasium",),
     "identify": ("optuna",),
 }

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from clients.errors import BadInput, ClientError
-from clients.log.export import export
+from clients.export.export import export
 from clients.log.reader import Log
 from sim_server.recording.recorder import Recorder
 from tests.sample_run import DT, REST, TETS, object_step, positions, record, state, topology, velocities

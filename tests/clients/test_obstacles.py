@@ -14,7 +14,7 @@ from rich.console import Console
 
 from clients.client import Client
 from clients.errors import BadInput
-from clients.log.export import export
+from clients.export.export import export
 from clients.log.obstacles import Obstacle, Pose, obstacle_of
 from clients.log.reader import Log
 from clients.obstacle import turned

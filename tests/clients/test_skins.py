@@ -7,7 +7,7 @@ import meshio
 import numpy as np
 import pytest
 
-from clients.log.export import export
+from clients.export.export import export
 from clients.log.frames import mesh_of
 from clients.log.reader import Log
 from clients.viewer.surface import Surface

@@ -20,7 +20,7 @@ RUN = """
 from pathlib import Path
 
 import numpy as np
-from clients.log.export import write_csv
+from clients.export.arrays import write_csv
 from clients.log.reader import Log
 from sim_server.backends.gpu.mailbox import library
 from sim_server.recording import messages

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from clients.errors import BadInput
-from clients.log.export import export
+from clients.export.export import export
 from clients.log.frames import mesh_of
 from clients.log.reader import Log
 from clients.viewer import film

@@ -10,7 +10,7 @@ import pytest
 
 from clients.client import Client
 from clients.errors import BadInput
-from clients.log.export import export
+from clients.export.export import export
 from clients.log.reader import Log
 from clients.viewer.surface import Surface
 from clients.web.feed import Link

@@ -13,7 +13,7 @@ from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 
 from clients.errors import BadInput
-from clients.log.export import export
+from clients.export.export import export
 from clients.log.reader import Log
 from protocol import messages_pb2 as pb
 from tests.support.commands import in_turn

@@ -39,7 +39,7 @@ def bare(then: str, posix: bool = True) -> "subprocess.CompletedProcess[str]":
 
 
 def test_a_client_imports_nothing_of_an_extra_and_nothing_of_linux() -> None:
-    names = ("client", "__main__", "log.reader", "log.export", "haptics.run", "watch", "demo.run", "replay.command")
+    names = ("client", "__main__", "log.reader", "export.export", "haptics.run", "watch", "demo.run", "replay.command")
     found = bare(f"import warpfactor as wf, clients.{', clients.'.join(names)}\nprint(wf.Client, wf.Log)", posix=False)
     assert found.returncode == 0, found.stderr
     assert "clients.client.Client" in found.stdout
@@ -70,9 +70,10 @@ def test_each_extra_lists_packages_and_all_has_those_of_every_machine() -> None:
     """None is this package itself, under a name that no index has; a device and a build from source are not for all."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     extras = project["optional-dependencies"]
-    assert set(extras) == {"server", "mesh", "gpu", "view", "web", "gym", "identify", "all", "cholmod", "docs", "test"}
+    machines = {"server", "mesh", "gpu", "view", "web", "export", "gym", "identify", "all", "cholmod"}
+    assert set(extras) == machines | {"docs", "test"}
     assert not [line for lines in extras.values() for line in lines if line.startswith("warpfactor")]
-    assert set(extras["all"]) == {line for name in ("server", "mesh", "view", "web") for line in extras[name]}
+    assert set(extras["all"]) == {line for name in ("server", "mesh", "view", "web", "export") for line in extras[name]}
     assert set(EXTRAS) <= set(extras)
     assert requires("warpfactor")  # it is installed with them
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Exports a log: .npz (frames and scalars of an object), .csv (scalars per step), .vtu (ParaView)."""
+"""Exports an object of a log as .npz (frames and scalars) or .csv (scalars per step)."""
 
 from __future__ import annotations
 
@@ -11,41 +11,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from clients.errors import BadInput, ClientError
+from clients.errors import BadInput
 from clients.log.atomic_file import atomic_file
-from clients.log.export_vtu import write_vtu
 from clients.log.frames import Mesh
 from clients.log.reader import Log
-
-FORMATS = (".npz", ".csv", ".vtu")
-
-
-def export(
-    log: Log,
-    name: str,
-    to: Path,
-    frame: str = "last",
-    epoch: int | None = None,
-    progress: Callable[[int], None] = lambda _: None,
-) -> list[Path]:
-    """Writes the records of object `name` in the format that the suffix of `to` says. Returns the files.
-
-    frame: "last", "all" or a frame number (negative from the end), for .vtu. epoch: for .npz, which has one mesh.
-    Raises BadInput for a bad name, suffix or frame, ClientError if the file cannot be written.
-    """
-    log.object_log(name)
-    if to.suffix not in FORMATS:
-        raise BadInput(f"--to {to}: the suffix {to.suffix!r} is not one of {', '.join(FORMATS)}")
-    try:
-        if to.suffix == ".npz":
-            write_npz(log, name, to, epoch, progress)
-        elif to.suffix == ".csv":
-            write_csv(log, name, to)
-        else:
-            return write_vtu(log, name, to, frame, progress)
-    except OSError as error:
-        raise ClientError(f"{to}: cannot be written: {error.strerror or error}") from None
-    return [to]
 
 
 def write_npz(

@@ -1,0 +1,2 @@
+# SPDX-License-Identifier: MIT
+"""A log as files of other programs."""
