@@ -821,6 +821,34 @@ def plan(
 
 
 @app.command()
+def identify(
+    scene: Annotated[Path, typer.Argument(metavar="SCENE.toml", help="What was measured, with its loads.")],
+    curves: Annotated[Path, typer.Argument(metavar="CURVES.csv", help="time and measured columns.")],
+    fit: Annotated[list[str], typer.Option("--fit", metavar="KEY=LOW:HIGH", help="What to find; repeatable.")],
+    runs: Annotated[int, typer.Option(metavar="N", help="At most, in all.")] = 60,
+    seed: Annotated[int, typer.Option(min=0, max=2**31, help="Of random tries.")] = 0,
+    to: Annotated[Path | None, typer.Option(metavar="FILE.toml", help="Overlay; SCENE.identified.toml.")] = None,
+    journal: Annotated[Path | None, typer.Option(metavar="FILE", help="Of runs; identify-SCENE.journal.")] = None,
+    device: Annotated[str, typer.Option(metavar="auto|cpu|gpu", help="Of the servers.")] = "auto",
+    as_json: Json = False,
+) -> None:
+    """Find parameters with which a scene moves as was measured, and write them for sim-server --set @FILE.
+
+    Starts a server for each run. CURVES.csv has the columns time [s], OBJECT[NODE].y (displacement of a node, by
+    number or by its place at rest X Y Z [m]) and OBJECT/NAME.fy (force on a holder or obstacle [N]). Runs are kept as
+    they come: after Ctrl-C, or with more --runs, the same command goes on.
+
+    \b
+    Examples:
+      sim-client identify beam.toml tip.csv --fit object.beam.effects.corotational.young=1e4:1e7
+      sim-client identify beam.toml tip.csv --fit ...young=1e4:1e7 --fit object.beam.effects.rayleigh.mass=0:5
+    """
+    from clients.identify.run import identify as run
+
+    run(scene, curves, fit, runs, seed, to, journal, device, as_json)
+
+
+@app.command()
 def replay(
     log: Annotated[Path, typer.Argument(metavar="LOG.mcap", help="A recorded run.")],
     simulate: Annotated[bool, typer.Option("--simulate", help="Run it again and compare bit by bit.")] = False,

@@ -25,6 +25,7 @@ ALLOWED = {  # what each folder imports of its package
     "clients.export": {"client", "errors", "log", "viewer"},
     "clients.haptics": {"client", "errors", "obstacle"},
     "clients.log": {"errors"},
+    "clients.identify": {"accuracy", "errors", "log", "plan", "progress"},
     "clients.materials": {"errors"},
     "clients.web": {"client", "errors", "log", "viewer"},
     "clients.viewer": {"client", "errors", "log", "progress"},

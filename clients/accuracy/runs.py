@@ -60,6 +60,7 @@ class Run:
     device: str = ""
     software: str = ""
     elements: dict[str, int] = field(default_factory=dict)  # by object
+    read: Any = None  # what `read` of run_point returned
 
 
 def run_point(
@@ -69,17 +70,22 @@ def run_point(
     timeout: float = 600.0,
     tick: Callable[[], None] = lambda: None,
     folder: Path | None = None,
+    read: Callable[[Log], Any] = lambda log: None,
 ) -> Run:
     """Runs the scene at `settings` for the duration of the task, and returns what came of it.
 
     The process ends before this returns, whatever happens. `tick` is called about every POLL seconds.
     timeout: wall time of the whole process [s]. folder: for the log, which is removed; by default a temporary one.
+    read: is given the log of a run that is done, and may raise BadInput.
     """
     began = time.monotonic()
     with tempfile.TemporaryDirectory(prefix=LOG_FOLDER, dir=folder) as place:
         log, said = Path(place) / "run.mcap", Path(place) / "said.txt"
         code = _serve(task, settings, workers, began + timeout, tick, log, said)
         run = _outcome(code, log, said, task.interval)
+        if run.status == "done":
+            with Log(log) as found:
+                run.read = read(found)
     run.wall = time.monotonic() - began
     if run.status == "timed out":
         run.reason = f"not over after {timeout:.3g} s"

@@ -57,13 +57,16 @@ def _string(text: str) -> str:
     return json.dumps(text, ensure_ascii=False)
 
 
-def check_path(path: Path) -> None:
-    """Raises BadInput for a path at which there is something other than an overlay of this program, or no folder."""
+def check_path(path: Path, mark: str = MARK) -> None:
+    """Raises BadInput for a path at which there is something other than an overlay of a command, or no folder.
+
+    mark: begins the first comment of its overlays
+    """
     if not path.parent.is_dir():
         raise BadInput(f"--to {path}: no such folder")
     try:
         with path.open(encoding="utf-8", errors="replace") as file:
-            if not file.readline().startswith(f"# {MARK}"):
+            if not file.readline().startswith(f"# {mark}"):
                 raise BadInput(f"{path}: is there and was not written by this command; --to FILE takes another name")
     except FileNotFoundError:
         return

@@ -59,6 +59,7 @@ def test_what_needs_an_extra_names_it() -> None:
     accuracy = "sys.argv[1:] = ['accuracy', 'a.toml']\nfrom clients.__main__ import main\nmain()"
     (line,) = bare(accuracy).stderr.splitlines()
     assert line.startswith("sim-client: this needs the package ") and "of the extra server: " in line
+    assert "of the extra identify: " in missing_extra(ModuleNotFoundError("no", name="optuna"))
     assert missing_extra(ModuleNotFoundError("no", name="viser.theme")).startswith(
         "this needs the package viser, of the extra web: "
     )
