@@ -636,19 +636,20 @@ def web(
 @app.command()
 def export(
     log: Annotated[Path, typer.Argument(metavar="LOG.mcap", help="A recorded run.")],
-    to: Annotated[Path, typer.Option(metavar="FILE", help="FILE.npz, .csv, .vtu, .vtkhdf, .usdc or .mp4.")],
+    to: Annotated[Path, typer.Option(metavar="FILE", help="FILE.npz, .csv, .vtu, .vtkhdf, .usdc, .mp4 or .mcap.")],
     object: Annotated[str | None, typer.Option(metavar="NAME", help="By default all objects.")] = None,
     frame: Annotated[str, typer.Option(help="Of a .vtu: last, a number (0 first, -1 last), or all.")] = "last",
     epoch: Annotated[int | None, typer.Option(help="Of an .npz: which mesh, if cuts changed it.")] = None,
 ) -> None:
     """Write a log for other programs.
 
-    .npz (NumPy), .csv (scalars), .vtu and .vtkhdf (ParaView), .usdc (Blender), .mp4 (film).
+    .npz (NumPy), .csv (scalars), .vtu and .vtkhdf (ParaView), .usdc (Blender), .mp4 (film), .mcap (Foxglove).
 
     \b
     Examples:
       sim-client export run.mcap --to run.vtkhdf
       sim-client export run.mcap --to run.usdc
+      sim-client export run.mcap --to run.foxglove.mcap
       sim-client export run.mcap --object beam --to beam.npz
       sim-client export run.mcap --object beam --to beam.vtu --frame all
     """
@@ -660,6 +661,39 @@ def export(
         with progress_bar("writing", sum(len(each.frames) for each in chosen)) as progress:
             written = write(opened, object, to, frame, epoch, progress)
         print(f"wrote {written[-1]}" + (f" and {len(written) - 1} more" if len(written) > 1 else ""))
+
+
+@app.command()
+def foxglove(
+    host: Annotated[str, typer.Option(metavar="HOST", help="Where it listens; who reaches it sees the run.")] = HOST,
+    port: Annotated[int, typer.Option(metavar="PORT", min=1, max=65535, help="Of the WebSocket server.")] = 8765,
+    layout: Annotated[Path | None, typer.Option(metavar="FILE.json", help="Also write a layout to import.")] = None,
+    connect: Connect = None,
+    server: Server = SERVER_NAME,
+) -> None:
+    """Show a running server in Foxglove or Lichtblick, until Ctrl-C: open ws://127.0.0.1:8765 there.
+
+    \b
+    Examples:
+      sim-client foxglove
+      sim-client foxglove --layout beam.layout.json
+      sim-client foxglove --port 8766 --connect tcp/192.168.1.5:7447
+    """
+    from clients.client import Client
+    from clients.export import foxglove_live
+    from protocol.network.hosts import beyond_loopback
+    from protocol.network.web_address import shown
+
+    with Client(server, connect) as client:
+        if layout is not None:
+            foxglove_live.write_layout(client, layout)
+        if beyond_loopback(f"tcp/{shown(host, port)}"):
+            print(f"sim-client: {shown(host, port)} is open to the network, without a login", file=sys.stderr)
+
+        def say(port: int) -> None:
+            print(f"sim-client: open ws://{shown(host, port)} in Foxglove or Lichtblick", flush=True)
+
+        foxglove_live.serve(client, host, port, say)
 
 
 @app.command()

@@ -11,7 +11,7 @@ from clients.export.arrays import write_csv, write_npz
 from clients.export.vtu import write_vtu
 from clients.log.reader import Log
 
-FORMATS = (".npz", ".csv", ".vtu", ".vtkhdf", ".usdc", ".mp4")
+FORMATS = (".npz", ".csv", ".vtu", ".vtkhdf", ".usdc", ".mp4", ".mcap")
 OF_ONE = (".npz", ".csv", ".vtu")
 """Formats whose files hold one object each; those of the others hold all."""
 
@@ -36,6 +36,8 @@ def export(
     names = sorted(log.objects) if name is None else [log.object_log(name).name]
     if to.suffix not in FORMATS:
         raise BadInput(f"--to {to}: the suffix {to.suffix!r} is not one of {', '.join(FORMATS)}")
+    if to.exists() and log.path.exists() and to.samefile(log.path):
+        raise BadInput(f"--to {to}: this is the log itself; allowed: another file")
     if not names:
         raise BadInput(f"{log.path}: no object was recorded")
     try:
@@ -79,8 +81,12 @@ def _together(log: Log, names: Sequence[str], to: Path, progress: Progress) -> l
         from clients.export.usd import write_usd
 
         write_usd(log, names, to, progress)
-    else:
+    elif to.suffix == ".mp4":
         from clients.export.mp4 import write_mp4
 
         write_mp4(log, names, to, progress)
+    else:
+        from clients.export.foxglove_file import write_foxglove
+
+        return write_foxglove(log, names, to, progress)
     return [to]

@@ -10,7 +10,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, BinaryIO
 
 import numpy as np
 
@@ -99,6 +99,20 @@ def save_rrd(log: Log, to: Path, coloring: Coloring) -> None:
             part.write_bytes(stream.read() or b"")
     except OSError as error:
         raise ClientError(f"{to}: cannot be written: {error.strerror or error}") from None
+    finally:
+        recording.disconnect()
+
+
+def write_recording(log: Log, to: BinaryIO, application: str, recording_id: str | None) -> None:
+    """Writes the log as a recording of rerun to a stream, under the names that rerun gives. Raises OSError."""
+    recording = _recording(application, recording_id)
+    import rerun as rr
+
+    stream = rr.binary_stream(recording)
+    try:
+        show_log(log, recording, "displacement")
+        to.write(stream.read() or b"")
+        to.flush()
     finally:
         recording.disconnect()
 
@@ -202,10 +216,10 @@ def _connected_to(viewer: Viewer) -> Iterator[rr.RecordingStream]:
         recording.disconnect()
 
 
-def _recording() -> rr.RecordingStream:
+def _recording(application: str = "warpfactor", recording_id: str | None = None) -> rr.RecordingStream:
     os.environ.setdefault("RUST_LOG", "error")  # read by rerun when it is imported; its warnings are handled here
     try:
         import rerun as rr
     except ImportError:
         raise ClientError(f"rerun-sdk is not installed, of the extra view: {to_install('view')}") from None
-    return rr.RecordingStream("warpfactor")
+    return rr.RecordingStream(application, recording_id=recording_id)
