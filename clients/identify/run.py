@@ -108,9 +108,10 @@ def _digest(question: Question, scene: str) -> str:
 def _lines(question: Question, found: Found) -> list[str]:
     """Returns how good it is, and what is to be known of it."""
     curves = question.curves
+    words = "1 column" if len(curves.columns) == 1 else f"{len(curves.columns)} columns"
     lines = [
         f"misfit {found.misfit:.2g} of the largest value of each column (root mean square), "
-        f"{found.runs} runs, {len(curves.columns)} columns of {curves.path.name}"
+        f"{found.runs} runs, {words} of {curves.path.name}"
     ]
     for fit in question.fits:
         if min(share := fit.share(found.values[fit.key]), 1 - share) < 1e-3:
