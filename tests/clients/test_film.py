@@ -106,20 +106,20 @@ def test_a_hand_is_there_while_it_holds(tmp_path: Path) -> None:
     assert (np.abs(seen[3] / np.maximum(seen[3].sum(axis=-1, keepdims=True), 1) - colour / colour.sum()) < 0.05).any()
 
 
-def with_a_ball(path: Path, ball: bool) -> Path:
+def with_a_ball(path: Path, shown: bool) -> Path:
     """A body that stands still, and in front of it a ball that rises by 0.3 m a step."""
     place = {"position": pb.Vector(x=0.5, y=0.2, z=1.2), "rotation": pb.Quaternion(w=1)}
     with Recorder(path) as recorder:
         recorder.scene(scene(["beam"]))
         recorder.topology(topology("beam"))
-        if ball:
+        if shown:
             recorder.obstacle(
                 pb.Obstacle(header=header("ball"), shape="sphere", size=[0.15], moved="keyframes", **place)
             )
         for step in range(3):
             recorder.state(_still(step), block=True)
             place["position"].y = 0.2 + 0.3 * step
-            if ball:
+            if shown:
                 pose = pb.ObstaclePose(header=header("ball"), step=step, time=step * DT, **place)
                 recorder.pose(pose, block=True)
     return path
@@ -127,8 +127,8 @@ def with_a_ball(path: Path, ball: bool) -> Path:
 
 def test_obstacles_are_where_their_poses_are(tmp_path: Path) -> None:
     seen = []
-    for ball in (False, True):
-        with Log(with_a_ball(tmp_path / f"{ball}.mcap", ball)) as log:
+    for shown in (False, True):
+        with Log(with_a_ball(tmp_path / f"{shown}.mcap", shown)) as log:
             stage = Stage(log, (160, 120), Angle(nearness=0.8))
             seen.append([pixels(stage.draw(step * DT, caption=False)) for step in range(3)])
     different = [np.abs(with_it - without).max(axis=-1) > 30 for without, with_it in zip(*seen, strict=True)]
