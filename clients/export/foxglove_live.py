@@ -67,8 +67,7 @@ def _follow(client: Client, scene: FoxgloveScene, meshes: dict[str, Mesh], runni
         new = states.newest()
         for frame in new:
             frames[frame.object] = frame
-            mesh = meshes.get(frame.object)
-            if mesh is None or mesh.epoch != frame.epoch:
+            if not _fits(meshes.get(frame.object), frame):  # of a new epoch, or of a server that was started again
                 meshes = client.meshes()
         for step in steps.new():
             scene.step(step)
@@ -80,11 +79,15 @@ def _follow(client: Client, scene: FoxgloveScene, meshes: dict[str, Mesh], runni
             scene.upright(0.0)
         for frame in frames.values() if again else new:
             mesh = meshes.get(frame.object)
-            if mesh and mesh.epoch == frame.epoch and len(mesh.rest) == len(frame.x):
+            if mesh is not None and _fits(mesh, frame):
                 scene.frame(frame, mesh)
         for name, pose in (placed if again else moved).items():
             scene.pose(name, pose, 0.0)
         time.sleep(PERIOD)
+
+
+def _fits(mesh: Mesh | None, frame: Frame) -> bool:
+    return mesh is not None and mesh.epoch == frame.epoch and len(mesh.rest) == len(frame.x)
 
 
 def _box(meshes: dict[str, Mesh]) -> tuple[NDArray, NDArray]:

@@ -135,6 +135,17 @@ def test_vtk_reads_all_objects_at_every_time(log: Log, tmp_path: Path) -> None:
             np.testing.assert_array_equal(array_of(grid.GetCellData(), "young"), np.full(2, 1e5))
 
 
+def test_vtk_reads_a_vtu_and_its_skin(skinned: Log, tmp_path: Path) -> None:
+    vtk = pytest.importorskip("vtk")
+    export(skinned, None, tmp_path / "beam.vtu")
+    for name, points, cells in (("beam", positions(2), TETS), ("beam_skin", vertices(2), SKIN_TRIANGLES)):
+        reader = vtk.vtkXMLUnstructuredGridReader()
+        reader.SetFileName(str(tmp_path / f"{name}.vtu"))
+        reader.Update()
+        np.testing.assert_allclose(points_of(reader.GetOutput()), points, atol=1e-14)
+        np.testing.assert_array_equal(cells_of(reader.GetOutput()), cells)
+
+
 def test_a_vtkhdf_has_elements_once_and_frames_of_one_object(log: Log, tmp_path: Path) -> None:
     export(log, "beam", tmp_path / "beam.vtkhdf")
     with h5py.File(tmp_path / "beam.vtkhdf") as file:

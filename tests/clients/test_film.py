@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from clients.log.reader import Log
-from clients.viewer.film import HAND, Stage, gif
+from clients.viewer.film import HAND, Angle, Stage, gif
 from clients.viewer.painter import Camera, Piece, ball, paint, rod
 from protocol import messages_pb2 as pb
 from sim_server.recording.recorder import Recorder
@@ -104,6 +104,36 @@ def test_a_hand_is_there_while_it_holds(tmp_path: Path) -> None:
     assert [difference > 50 for difference in apart] == [False] * 3 + [True] * 3 + [False] * 2
     colour = np.array(HAND)[None, None]
     assert (np.abs(seen[3] / np.maximum(seen[3].sum(axis=-1, keepdims=True), 1) - colour / colour.sum()) < 0.05).any()
+
+
+def with_a_ball(path: Path, shown: bool) -> Path:
+    """A body that stands still, and in front of it a ball that rises by 0.3 m a step."""
+    place = {"position": pb.Vector(x=0.5, y=0.2, z=1.2), "rotation": pb.Quaternion(w=1)}
+    with Recorder(path) as recorder:
+        recorder.scene(scene(["beam"]))
+        recorder.topology(topology("beam"))
+        if shown:
+            recorder.obstacle(
+                pb.Obstacle(header=header("ball"), shape="sphere", size=[0.15], moved="keyframes", **place)
+            )
+        for step in range(3):
+            recorder.state(_still(step), block=True)
+            place["position"].y = 0.2 + 0.3 * step
+            if shown:
+                pose = pb.ObstaclePose(header=header("ball"), step=step, time=step * DT, **place)
+                recorder.pose(pose, block=True)
+    return path
+
+
+def test_obstacles_are_where_their_poses_are(tmp_path: Path) -> None:
+    seen = []
+    for shown in (False, True):
+        with Log(with_a_ball(tmp_path / f"{shown}.mcap", shown)) as log:
+            stage = Stage(log, (160, 120), Angle(nearness=0.8))
+            seen.append([pixels(stage.draw(step * DT, caption=False)) for step in range(3)])
+    different = [np.abs(with_it - without).max(axis=-1) > 30 for without, with_it in zip(*seen, strict=True)]
+    tops = [int(np.flatnonzero(picture.any(axis=1)).min()) for picture in different]
+    assert tops[1] < tops[0] - 5 and tops[2] < tops[1] - 5
 
 
 def test_a_film_has_as_many_pictures_as_its_time(tmp_path: Path) -> None:

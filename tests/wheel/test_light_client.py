@@ -63,6 +63,7 @@ def test_what_needs_an_extra_names_it() -> None:
     assert missing_extra(ModuleNotFoundError("no", name="viser.theme")).startswith(
         "this needs the package viser, of the extra web: "
     )
+    assert ", of the extra export: " in missing_extra(ModuleNotFoundError("no", name="pxr"))
     assert missing_extra(ModuleNotFoundError("no", name="nobody")) == missing_extra(ImportError("no")) == ""
 
 
