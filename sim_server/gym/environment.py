@@ -262,7 +262,7 @@ class VectorEnv(vector.VectorEnv[Float64, Any, Any]):
 
 def _host(array: Any) -> Float64:
     """Returns a copy on the host of an array of NumPy or CuPy."""
-    found: Float64 = array.get() if hasattr(array, "get") else np.array(array)
+    found: Float64 = np.array(array.get() if hasattr(array, "get") else array, dtype=float)
     return found
 
 

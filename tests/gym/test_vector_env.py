@@ -219,6 +219,55 @@ def test_copies_do_not_touch_each_other():
     env.close()
 
 
+PAIR = {
+    **FINGER, "effects": {"gravity": {}},
+    "object": [
+        {**FINGER["object"][0], "effects": {"corotational": {"young": 1e5, "poisson": 0.4}}},
+        {**FINGER["object"][0], "name": "load", "mesh": {"bar": [1, 1, 1], "size": [0.02, 0.02, 0.02]},
+         "pose": {"translate": [0.08, -0.05, 0]}, "effects": {"corotational": {"young": 1e5, "poisson": 0.4}}},
+    ],
+    "holder": [{
+        "name": "hand", "object": "finger", "where": "X < 0.001",
+        "keyframes": [{"time": 0}, {"time": 0.1, "translate": [0, 0.03, 0]}],
+    }],
+    "spring": [{
+        "name": "string", "stiffness": 50,
+        "between": [{"object": "finger", "at": [0.1, 0, 0]}, {"object": "load", "at": [0.02, 0.02, 0]}],
+    }],
+}  # fmt: skip
+
+
+def test_holders_and_springs_are_those_of_each_copy():
+    """A moved finger with a load on a string; a copy that begins again is moved again, from the beginning."""
+    seen = [{"load": 0}, {"finger": "X > 0.099 and Y < 0.001"}]
+    keys = {"reward": lambda s: np.zeros(N), "autoreset_mode": AutoresetMode.DISABLED}
+    env = wf.gym.VectorEnv(PAIR, N, wf.gym.Forces({"load": 0}, 0.1), seen, **keys)
+    env.reset()
+    actions = np.zeros((N, 3))
+    first = [env.step(actions)[0] for _ in range(12)]
+    with wf.Simulation(PAIR) as simulation:
+        simulation.step(12)
+        np.testing.assert_allclose(first[-1][:, :3], np.tile(simulation.positions("load")[0], (N, 1)), atol=1e-7)
+    assert (first[-1] == first[-1][0]).all() and np.abs(first[-1][0] - first[0][0]).max() > 0.01
+    env.reset(options={"reset_mask": np.arange(N) == 2})
+    again = [env.step(actions)[0] for _ in range(12)]
+    np.testing.assert_allclose([a[2] for a in again], [a[2] for a in first], atol=1e-7)
+    assert (again[-1][0] == again[-1][1]).all() and np.abs(again[-1][0] - again[-1][2]).max() > 1e-3
+    env.close()
+
+
+def test_copies_of_several_objects_that_touch_are_refused():
+    scene = {**PAIR, "effects": {"contact": {}}, "holder": None, "spring": None}
+    scene = {key: value for key, value in scene.items() if value is not None}
+    action = wf.gym.Forces({"load": 0}, 0.1)
+    with pytest.raises(InputError, match=r"contact\.between = true with the objects finger, load: their copies"):
+        wf.gym.VectorEnv(scene, N, action, {"load": 0}, reward=lambda s: np.zeros(N))
+    scene |= {"effects": {"contact": {"between": False}}, "obstacle": [{"name": "floor", "shape": "plane"}]}
+    wf.gym.VectorEnv(scene, N, action, {"load": 0}, reward=lambda s: np.zeros(N)).close()
+    with pytest.raises(InputError, match=r"observe = 'tip': the scene has several objects; write \{NAME: 'tip'\}"):
+        wf.gym.VectorEnv(scene, N, action, reward=lambda s: np.zeros(N))
+
+
 BAD_ACTIONS = [
     (np.zeros((N, 2)), r"actions of shape \(3, 2\): must be \(3, 3\)"),
     (np.full((N, 3), np.nan), r"actions\[0, 0\] = nan: must be from -0.1 to 0.1"),
