@@ -15,7 +15,7 @@ from clients.viewer.film import Angle, Stage
 
 SIZE = (960, 720)  # pixels; both whole multiples of 16, as encoders like it
 RATE = 30.0  # pictures in a second
-ANGLE = Angle(nearness=1.1)  # all of the bodies in view
+ANGLE = Angle(nearness=0.95)  # bodies and the caption below
 
 
 def write_mp4(

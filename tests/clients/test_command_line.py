@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 
 from tests.clients.fake_server import FakeServer
+from tests.ports import free_port
 from tests.sample_run import record
 from tests.support.commands import Ended, in_turn
 
@@ -204,6 +205,7 @@ COMMANDS = (
     "worker",
     "view",
     "export",
+    "foxglove",
 )
 
 
@@ -238,6 +240,27 @@ def test_export(tmp_path: Path) -> None:
         assert found["x"].shape == (6, 5, 3)
     code, out, _ = run("export", log, "--object", "beam", "--to", tmp_path / "beam.vtu", "--frame", "all")
     assert code == 0 and out == f"wrote {tmp_path / 'beam.pvd'} and 6 more\n"
+
+
+def test_export_of_all_objects(tmp_path: Path) -> None:
+    log = record(tmp_path / "run.mcap", 5, ("beam", "liver"))
+    code, out, err = run("export", log, "--to", tmp_path / "run.csv")
+    assert (code, err) == (0, "") and out == f"wrote {tmp_path / 'run_liver.csv'} and 1 more\n"
+    code, out, err = run("export", log, "--to", tmp_path / "run.foxglove.mcap")
+    assert (code, err) == (0, "") and out == f"wrote {tmp_path / 'run.foxglove.mcap'} and 1 more\n"
+    code, out, err = run("export", log, "--to", tmp_path / "run.obj")
+    assert (code, out) == (2, "") and ".vtu, .vtkhdf, .usdc, .mp4, .mcap" in err
+
+
+def test_the_bridge_to_foxglove_ends_by_ctrl_c(server: FakeServer, tmp_path: Path) -> None:
+    port, layout = str(free_port()), tmp_path / "layout.json"
+    process = start("foxglove", "--port", port, "--layout", layout, "--connect", server.endpoint)
+    assert process.stdout is not None
+    assert process.stdout.readline() == f"sim-client: open ws://127.0.0.1:{port} in Foxglove or Lichtblick\n"
+    process.send_signal(signal.SIGINT)
+    out, err = process.communicate(timeout=30)
+    assert (process.returncode, out, err) == (130, "", "")
+    assert "/step/liver.kinetic_energy" in layout.read_text()
 
 
 def test_export_of_a_cut_log_says_so(tmp_path: Path) -> None:
