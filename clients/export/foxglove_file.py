@@ -12,12 +12,15 @@ from google.protobuf.message import DecodeError
 
 from clients.export.box import box_of
 from clients.export.foxglove_layout import layout
-from clients.export.foxglove_scene import FoxgloveScene
+from clients.export.foxglove_scene import FoxgloveScene, reaction_topic
 from clients.log.atomic_file import atomic_file
 from clients.log.reader import Log
+from clients.log.scalars import REACTION, READING
 from clients.viewer.view import color_limit
 from protocol import messages_pb2 as pb
 from protocol.log_file import LogFile
+
+PLOTTED = 8  # topics of a plot of reactions, and of one of readings
 
 
 def write_foxglove(
@@ -33,16 +36,30 @@ def write_foxglove(
         part.touch()  # a bad path is reported as any other
         context = foxglove.Context()
         with foxglove.open_mcap(part, allow_overwrite=True, context=context):
-            skipped = _write(log, names, FoxgloveScene(context, lambda t: start + round(t * 1e9), _top(log)), progress)
+            skipped = _write(
+                log,
+                names,
+                FoxgloveScene(context, lambda t: start + round(t * 1e9), color_limit(log, "displacement")),
+                progress,
+            )
     with atomic_file(plan) as part:
-        part.write_text(layout(names))
+        part.write_text(layout(names, _forces(log, names), _readings(log, names)))
     if skipped:
         print(f"{log.path}: {skipped} frames with NaN or infinite positions are left out", file=sys.stderr)
     return [plan, to]
 
 
-def _top(log: Log) -> float:
-    return color_limit(log, "displacement")
+def _forces(log: Log, names: Sequence[str]) -> list[str]:
+    """Returns the first topics of reactions, as many as a plot shows."""
+    ending = "/force_x"
+    columns = ((n, c) for n in names for c in log.scalars(n) if c.startswith(REACTION) and c.endswith(ending))
+    return [reaction_topic(n, c.removeprefix(REACTION).removesuffix(ending)) for n, c in columns][:PLOTTED]
+
+
+def _readings(log: Log, names: Sequence[str]) -> list[str]:
+    """Returns the first topics of readings, as many as a plot shows."""
+    columns = ((n, c) for n in names for c in log.scalars(n) if c.startswith(READING))
+    return [f"/reading/{n}/{c.removeprefix(READING)}" for n, c in columns][:PLOTTED]
 
 
 def _write(log: Log, names: Sequence[str], scene: FoxgloveScene, progress: Callable[[float], None]) -> int:

@@ -16,13 +16,20 @@ PLOTS = {  # title -> fields of ObjectStep
 }
 
 
-def layout(names: Sequence[str]) -> str:
-    """Returns the layout as JSON, which both programs import from a file, for objects of these names."""
+def layout(names: Sequence[str], forces: Sequence[str] = (), readings: Sequence[str] = ()) -> str:
+    """Returns the layout as JSON, which both programs import from a file, for objects of these names.
+
+    forces, readings: topics of reactions and readings to plot; without any there is no such plot.
+    """
     view = "3D!bodies"
     panels: dict[str, Any] = {view: _bodies(names)}
     for number, (title, fields) in enumerate(PLOTS.items()):
         shown = names[:1] if title.startswith("step time") else names
-        panels[f"Plot!{number}"] = _plot(title, [(n, field) for n in shown for field in fields])
+        panels[f"Plot!{number}"] = _plot(title, [(f"/step/{n}", field) for n in shown for field in fields])
+    if forces:
+        panels["Plot!forces"] = _plot("reactions [N]", [(topic, f"force.{axis}") for topic in forces for axis in "xyz"])
+    if readings:
+        panels["Plot!readings"] = _plot("readings [SI unit]", [(topic, "value") for topic in readings])
     right = _stacked([name for name in panels if name != view])
     found = {
         "configById": panels,
@@ -50,12 +57,12 @@ def _bodies(names: Iterable[str]) -> dict[str, Any]:
 def _plot(title: str, curves: Iterable[tuple[str, str]]) -> dict[str, Any]:
     paths = [
         {
-            "value": f"{_topic(name)}.{field}",
-            "label": f"{name} {field}",
+            "value": f"{_quoted(topic)}.{field}",
+            "label": f"{topic.split('/', 2)[2]} {field}",
             "enabled": True,
             "timestampMethod": "receiveTime",
         }
-        for name, field in curves
+        for topic, field in curves
     ]
     return {
         "title": title, "foxglovePanelTitle": title, "paths": paths, "showLegend": True, "legendDisplay": "floating",
@@ -63,9 +70,9 @@ def _plot(title: str, curves: Iterable[tuple[str, str]]) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _topic(name: str) -> str:
-    """Returns the topic of the steps of an object as paths have it: in quotes where it holds more than letters."""
-    return f"/step/{name}" if re.fullmatch(r"\w+", name) else f'"/step/{name}"'
+def _quoted(topic: str) -> str:
+    """Returns a topic as paths have it: in quotes where it holds more than letters and slashes."""
+    return topic if re.fullmatch(r"[\w/]+", topic) else f'"{topic}"'
 
 
 def _stacked(panels: Sequence[str]) -> Any:

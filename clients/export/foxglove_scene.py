@@ -89,7 +89,7 @@ class FoxgloveScene:
         name, time = message.header.object, message.time
         self._log(f"/step/{name}", message, time)
         for reaction in message.reactions:
-            self._log(f"/reaction/{name}/{reaction_name(reaction).replace(':', '_')}", reaction, time)
+            self._log(reaction_topic(name, reaction_name(reaction)), reaction, time)
         for reading in message.readings:
             self._log(f"/reading/{name}/{reading.of}/{reading.quantity}", reading, time)
 
@@ -147,6 +147,11 @@ class FoxgloveScene:
                 topic, schema=_schema(message), message_encoding="protobuf", context=self._context
             )
         return self._messages[topic]
+
+
+def reaction_topic(name: str, what: str) -> str:
+    """Returns the topic of what an object exerts on something, by the name that `reaction_name` has for it."""
+    return f"/reaction/{name}/{what.replace(':', '_')}"
 
 
 def _schema(message: Message) -> foxglove.Schema:

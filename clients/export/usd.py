@@ -35,6 +35,8 @@ def write_usd(log: Log, names: Sequence[str], to: Path, progress: Callable[[floa
     """
     from pxr import Tf, Usd, UsdGeom
 
+    names = [name for name in names if log.object_log(name).frames]
+    paths = _paths([*names, *log.obstacles])
     with atomic_file(to) as part:
         part.touch()  # a bad path is reported before the conversion; USD would make its folders
         stage = Usd.Stage.CreateInMemory()
@@ -46,7 +48,7 @@ def write_usd(log: Log, names: Sequence[str], to: Path, progress: Callable[[floa
         stage.SetDefaultPrim(UsdGeom.Xform.Define(stage, "/World").GetPrim())
         done, skipped, end = 0, 0, 0.0
         for number, name in enumerate(names):
-            body = _Body(stage, f"/World/{Tf.MakeValidIdentifier(name)}", BODIES[number % len(BODIES)] / 255)
+            body = _Body(stage, paths[name], BODIES[number % len(BODIES)] / 255)
             for frame in log.frames(name):
                 done, end = done + 1, max(end, frame.time)
                 progress(done)
@@ -56,7 +58,7 @@ def write_usd(log: Log, names: Sequence[str], to: Path, progress: Callable[[floa
                     skipped += 1
         box = box_of(log, names)
         for obstacle in log.obstacles.values():
-            _write_obstacle(stage, f"/World/{Tf.MakeValidIdentifier(obstacle.name)}", log, obstacle, box, rate)
+            _write_obstacle(stage, paths[obstacle.name], log, obstacle, box, rate)
         stage.SetStartTimeCode(0.0)
         stage.SetEndTimeCode(end * rate)
         try:
@@ -65,6 +67,19 @@ def write_usd(log: Log, names: Sequence[str], to: Path, progress: Callable[[floa
             raise OSError(str(error).strip()) from None
     if skipped:
         print(f"{log.path}: {skipped} frames with NaN or infinite positions are left out", file=sys.stderr)
+
+
+def _paths(names: Sequence[str]) -> dict[str, str]:
+    """Returns a path for each name, in which what a name may not hold in USD is an underscore."""
+    from pxr import Tf
+
+    found: dict[str, str] = {}
+    for name in names:
+        path = f"/World/{Tf.MakeValidIdentifier(name)}"
+        while path in found.values():  # "left.leg" beside "left_leg"
+            path += "_"
+        found[name] = path
+    return found
 
 
 def _rate(log: Log, names: Sequence[str]) -> float:

@@ -20,6 +20,7 @@ from clients.log.von_mises import StressField
 from clients.viewer.surface import Surface
 from protocol import messages_pb2 as pb
 from sim_server.recording.recorder import Recorder
+from tests.clients.test_foxglove import corners, decoded
 from tests.sample_contact import record_contact
 from tests.sample_run import DT, REST, TETS, TRIANGLES, header, positions, record, scene, state, topology, velocities
 
@@ -239,6 +240,28 @@ def test_usd_follows_cuts_and_shows_skins(cut_log: Log, skinned: Log, tmp_path: 
     stage = Usd.Stage.Open(str(tmp_path / "skinned.usdc"))
     points = UsdGeom.Mesh(stage.GetPrimAtPath("/World/beam/surface")).GetPointsAttr().Get(2)
     np.testing.assert_allclose(np.array(points), vertices(2), atol=1e-6)
+
+
+def test_foxglove_follows_cuts_and_shows_skins(cut_log: Log, skinned: Log, tmp_path: Path) -> None:
+    export(cut_log, None, tmp_path / "cut.foxglove.mcap")
+    entities = [update.entities[0] for _, _, update in decoded(tmp_path / "cut.foxglove.mcap")["/bodies"]]
+    for index, entity in enumerate(entities):
+        drawn = Surface(cut_log.mesh("beam", cut_log.objects["beam"].epochs[index]), "displacement")
+        points, triangles = corners(entity)
+        np.testing.assert_array_equal(triangles, drawn.triangles)
+        assert len(points) == len(drawn.nodes)
+    assert len(entities) == 6
+    export(skinned, None, tmp_path / "skinned.foxglove.mcap")
+    _, _, update = decoded(tmp_path / "skinned.foxglove.mcap")["/bodies"][2]
+    np.testing.assert_allclose(corners(update.entities[0])[0], vertices(2), atol=1e-6)
+
+
+def test_names_that_usd_does_not_allow(tmp_path: Path) -> None:
+    with Log(record(tmp_path / "run.mcap", 2, ("left_leg", "left.leg"))) as log:
+        export(log, None, tmp_path / "run.usdc")
+    stage = Usd.Stage.Open(str(tmp_path / "run.usdc"))
+    for name in ("left_leg", "left_leg_"):
+        assert len(UsdGeom.Mesh(stage.GetPrimAtPath(f"/World/{name}/surface")).GetPointsAttr().GetTimeSamples()) == 3
 
 
 def test_usd_moves_obstacles(tmp_path: Path) -> None:

@@ -116,6 +116,9 @@ def test_reactions_have_channels_and_obstacles_move(tmp_path: Path) -> None:
     assert [(m.force.x, m.force.z) for _, _, m in tool] == [(3.0, 4.0 * step) for step in range(3, STEPS + 1)]
     assert {schema for _, schema, _ in tool} == {"warpfactor.Reaction"}
     assert [m.force.y for _, _, m in found["/reaction/beam/floor"]] == [-7.0]
+    plan = json.loads((tmp_path / "run.layout.json").read_text())["configById"]
+    assert [p["value"] for p in plan["Plot!forces"]["paths"]][-1] == "/reaction/beam/tool.force.z"
+    assert "Plot!readings" not in plan
     solids = [(at, e) for at, _, update in found["/obstacles"] for e in update.entities]
     assert {e.id for _, e in solids} == {"floor", "ball", "block", "tool", "bowl"}
     heights = [(at, e.triangles[0].pose.position.y) for at, e in solids if e.id == "tool"][1:]
@@ -134,6 +137,8 @@ def test_readings_have_channels(tmp_path: Path) -> None:
         export(log, None, tmp_path / "out.mcap")
     found = decoded(tmp_path / "out.mcap")["/reading/beam/cavity[1]/pressure"]
     assert [(name, m.value) for _, name, m in found] == [("warpfactor.Reading", 5.0), ("warpfactor.Reading", 10.0)]
+    (path,) = json.loads((tmp_path / "out.layout.json").read_text())["configById"]["Plot!readings"]["paths"]
+    assert path["value"] == '"/reading/beam/cavity[1]/pressure".value'
 
 
 def test_the_layout_names_topics_of_the_file(tmp_path: Path) -> None:
