@@ -7,6 +7,7 @@ import hashlib
 import json
 import math
 import shlex
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -56,8 +57,12 @@ def identify(
     where = where or Path(f"identify-{scene.stem}.journal")
     probed, scene_digest = probe(scene, device)
     search = Search(where, question.fits, seed, _digest(question, scene_digest))
-    with titled_progress_bar(runs) as progress:
-        found = search.run(Attempts(question, probed), runs, lambda n, m: progress(n, f"{n} runs, misfit {m:.2g}"))
+    try:
+        with titled_progress_bar(runs) as progress:
+            found = search.run(Attempts(question, probed), runs, lambda n, m: progress(n, f"{n} runs, misfit {m:.2g}"))
+    except KeyboardInterrupt:
+        print(f"sim-client: the runs made so far are in {where}; the same command goes on", file=sys.stderr)
+        raise
     settings = {key: f"{value:.8g}" for key, value in found.values.items()}
     use = shlex.join(["sim-server", str(scene), "--set", f"@{to}"])
     overlay.write(to, settings, [MARK, *_lines(question, found), f"use: {use}"])

@@ -79,6 +79,12 @@ def test_copies_move_as_one_body_alone(env):
     assert np.ptp(found[-1], axis=0).max() > 1e-3, "they differ"
 
 
+def test_all_copies_are_stepped_by_the_launches_of_one(env):
+    with wf.Simulation(FINGER, forces=True) as simulation:
+        one = [launch.name for launch in simulation.inside.engine.launches]
+    assert [launch.name for launch in env.simulation.inside.engine.launches] == one
+
+
 def test_equal_actions_give_equal_copies_to_the_bit(env):
     env.reset()
     for a in ACTIONS:
