@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Exports all frames of a log as one VTKHDF file for ParaView 5.12 or later, by h5py.
+"""Exports all frames of a log as one VTKHDF file for ParaView, by h5py.
 
 An object is a transient unstructured grid: its elements are written once for each mesh that it had, whatever the
 number of frames. Several grids (of objects and of their skins) are the blocks of a partitioned data set collection,
@@ -23,7 +23,8 @@ from clients.log.von_mises import StressField
 if TYPE_CHECKING:
     import h5py
 
-VERSION = (2, 2)  # of the format: the first with Steps in all blocks of a collection
+# Versions of the format: the first with times, and the first with collections. Readers warn of newer ones than theirs.
+GRID, COLLECTION = (2, 0), (2, 1)
 TETRA, TRIANGLE = 10, 5  # VTK's numbers of cells
 
 
@@ -53,7 +54,7 @@ def write_vtkhdf(log: Log, names: Sequence[str], to: Path, progress: Callable[[f
         if len(grids) == 1:
             _write_grid(root, log, *grids[0], steps, times, progress)
             return
-        _describe(root, "PartitionedDataSetCollection")
+        _describe(root, "PartitionedDataSetCollection", COLLECTION)
         assembly, done = root.create_group("Assembly", track_order=True), 0
         for index, (name, skin) in enumerate(grids):
             label = f"{name}_skin" if skin else name
@@ -72,9 +73,9 @@ def _has_skin(log: Log, name: str) -> bool:
     return log.mesh(name, log.object_log(name).epochs[0]).skin is not None
 
 
-def _describe(group: h5py.Group, kind: str) -> None:
+def _describe(group: h5py.Group, kind: str, version: tuple[int, int]) -> None:
     """Notes type and version. VTK reads the type as a string of fixed length."""
-    group.attrs["Version"] = VERSION
+    group.attrs["Version"] = version
     group.attrs.create("Type", kind.encode("ascii"), dtype=f"S{len(kind)}")
 
 
@@ -97,7 +98,7 @@ def _write_grid(
     epochs = log.object_log(name).epochs
     number = {epoch: k for k, epoch in enumerate(dict.fromkeys(epochs))}
     parts = [_part(log.mesh(name, epoch), skin) for epoch in number]
-    _describe(group, "UnstructuredGrid")
+    _describe(group, "UnstructuredGrid", GRID)
     _write_cells(group, parts, TRIANGLE if skin else TETRA)
     first = np.cumsum([0, *(parts[number[epoch]].points for epoch in epochs)])
     _write_points(group, log, name, skin, first, steps, times, progress)
