@@ -16,6 +16,7 @@
 // An iteration is one application of A after the initial residual.
 #pragma once
 #include "bsr.h"
+#include "factor_sweeps.h"
 #include "iterate_error.h"
 #include "kinds.h"
 #include "ring_buffers.h"
@@ -78,17 +79,12 @@ struct Preconditioner {
     // z = P^-1 r; returns z . r
     double apply(const double* r, double r_norm, double* z) {
         int n = A.size();
-        if (kind == CHOLESKY && factor->bytes == 4)
-            with_factor<float>(r, r_norm, z);
-        else if (kind == CHOLESKY)
-            with_factor<double>(r, r_norm, z);
-        else if (kind == SSOR)
-            apply_ssor(A, inverse, omega, r, z);
-        else if (kind == NONE)
-            for (int i = 0; i < n; ++i) z[i] = r[i];
-        else
-            apply_diagonal(n / 3, inverse, r, z);
-        return dot(n, z, r);
+        if (kind == CHOLESKY && factor->bytes == 4) return with_factor<float>(r, r_norm, z);
+        if (kind == CHOLESKY) return with_factor<double>(r, r_norm, z);
+        if (kind == JACOBI || kind == BLOCK_JACOBI) return apply_diagonal(A, inverse, r, z);
+        if (kind == SSOR) apply_ssor(A, inverse, omega, r, z);
+        else std::copy(r, r + n, z);
+        return dot(A, z, r);
     }
     bool is_cut() {
         CutSolve around{*correction->cut, A};
@@ -96,16 +92,18 @@ struct Preconditioner {
         return around.works();
     }
     template <class T>
-    void with_factor(const double* r, double r_norm, double* z) {
+    double with_factor(const double* r, double r_norm, double* z) {
         if (!cut) return apply_alone<T>(r, r_norm, z);
         CutSolve{*correction->cut, A}.around(r, z, [&](const double* from, double* to) { apply_alone<T>(from, r_norm, to); });
+        return dot(A, z, r);
     }
     template <class T>
-    void apply_alone(const double* r, double r_norm, double* z) {
+    double apply_alone(const double* r, double r_norm, double* z) {
         const T* values = (const T*)factor->values;
-        auto correct = [&](T* y) { Corrected{*correction, A, *factor}.between(y); };
-        if (corrects) apply_factor(*factor->pattern, values, r, 1 / r_norm, z, (T*)work, correct);
-        else apply_factor(*factor->pattern, values, r, 1 / r_norm, z, (T*)work);
+        auto correct = [&](T* y) { if (corrects) Corrected{*correction, A, *factor}.between(y); };
+        if (FactorPlan* plan = factor->pattern->plan) return apply_factor(*plan, values, r, 1 / r_norm, z, A.parts(), !corrects, correct);
+        apply_factor(*factor->pattern, values, r, 1 / r_norm, z, (T*)work, correct);
+        return dot(A, z, r);
     }
 };
 
@@ -128,7 +126,7 @@ static SolveResult pcg(const BlockCsr& A, const double* b, const Factor* factor,
     };
     auto zero = [&] { for (int i = 0; i < n; ++i) x[i] = 0; };
 
-    double b2 = dot(n, b, b);
+    double b2 = dot(A, b, b);
     if (!std::isfinite(b2)) {
         for (int i = 0; i < n; ++i) x[i] = NAN;  // the kernel `advance` takes the body back
         return finish(NOT_FINITE, b2, 1);
@@ -175,7 +173,7 @@ static SolveResult pcg(const BlockCsr& A, const double* b, const Factor* factor,
         return -1;
     };
     for (;;) {
-        double zr = applied ? dot(n, z, r) : P.apply(r, std::sqrt(r2), z);       // 1. 6. z = P^-1 r
+        double zr = applied ? dot(A, z, r) : P.apply(r, std::sqrt(r2), z);       // 1. 6. z = P^-1 r
         applied = false;
         if (!(zr > 0 && zr < INFINITY)) {                                        // also NaN
             if (P.kind != CHOLESKY) return finish(BREAKDOWN_PRECONDITIONER, residual(A, b, x, r), b2);
@@ -189,7 +187,7 @@ static SolveResult pcg(const BlockCsr& A, const double* b, const Factor* factor,
             if (status >= 0) return finish(status, r2, b2);
             continue;
         }
-        conjugate(n, restart ? 0 : zr / rz, z, p);                               // 7. 8. p = z + beta p
+        conjugate(A, restart ? 0 : zr / rz, z, p);                               // 7. 8. p = z + beta p
         rz = zr;
         restart = false;
         if (out.iterations == settings.max_iterations) return finish(MAX_ITERATIONS, residual(A, b, x, r), b2);
@@ -213,7 +211,7 @@ static SolveResult pcg(const BlockCsr& A, const double* b, const Factor* factor,
         double pq = multiply(A, p, q);
         ++out.iterations;
         if (!(pq > 0)) return finish(BREAKDOWN_MATRIX, residual(A, b, x, r), b2);
-        r2 = descend(n, rz / pq, p, q, x, r);                                    // 3. 4. 5.
+        r2 = descend(A, rz / pq, p, q, x, r);                                    // 3. 4. 5.
         error.move(rz / pq);
         const bool enough = is_enough(true);
         if (r2 > goal && !enough) continue;
@@ -227,7 +225,7 @@ static double apply_to(const BlockCsr& A, const double* b, const Factor* factor,
                        Correction* correction) {
     const int n = A.size();
     double *r = work, *z = r + n, *inverse = z + 3 * n, *scratch = inverse + 3 * n;
-    const double norm = std::sqrt(dot(n, b, b));
+    const double norm = std::sqrt(dot(A, b, b));
     std::copy(b, b + n, r);
     if (norm == 0) return 0;
     Preconditioner P{A, factor, kind, inverse, scratch, omega, correction};

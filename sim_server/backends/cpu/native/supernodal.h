@@ -6,6 +6,8 @@
 #pragma once
 #include <cstdint>
 
+struct FactorPlan;
+
 struct Pattern {
     int32_t size;                // degrees of freedom
     int32_t supernodes;
@@ -14,6 +16,7 @@ struct Pattern {
     const int64_t* row_start;    // (supernodes + 1,) into rows
     const int32_t* rows;
     const int64_t* value_start;  // (supernodes,) into the values
+    FactorPlan* plan;            // how threads share the solves (factor_plan.h); null: one does all
 };
 
 template <class T>
