@@ -4,7 +4,7 @@
 import csv
 import os
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import nullcontext
 from itertools import product
 from pathlib import Path
@@ -148,23 +148,27 @@ def _checked(scene: Scene, values: Mapping[str, Any]) -> Scene:
 
 
 def _found(jobs: list[tuple[Any, ...]], executor: Any, processes: int) -> Iterator[dict[str, Any]]:
-    """Yields the rows of jobs in their order; shows on a terminal how many there are."""
+    """Yields the rows of jobs in their order."""
     if processes < 1:
         raise InputError(f"sweep: processes = {processes}: must be 1 or more")
-    quiet = {"description": "runs", "total": len(jobs), "disable": not sys.stderr.isatty(), "transient": True}
-    console = Console(stderr=True)
     if executor is not None:
         with executor.batch() if hasattr(executor, "batch") else nullcontext():
             waiting = [executor.submit(run, *job) for job in jobs]
-        yield from track((_result(each) for each in waiting), console=console, **quiet)
+        yield from _shown((_result(each) for each in waiting), len(jobs))
     elif processes == 1 or len(jobs) == 1:
-        yield from track((run(*job) for job in jobs), console=console, **quiet)
+        yield from _shown((run(*job) for job in jobs), len(jobs))
     else:
         from loky import ProcessPoolExecutor  # processes that need no guard in the user's script
 
         with ProcessPoolExecutor(min(processes, len(jobs)), env=ALONE) as pool:
             waiting = [pool.submit(run, *job) for job in jobs]
-            yield from track((_result(each) for each in waiting), console=console, **quiet)
+            yield from _shown((_result(each) for each in waiting), len(jobs))
+
+
+def _shown(rows: Iterable[dict[str, Any]], count: int) -> Iterator[dict[str, Any]]:
+    """Yields rows; shows on a terminal how many of them there are."""
+    where = Console(stderr=True)
+    yield from track(rows, "runs", count, console=where, transient=True, disable=not sys.stderr.isatty())
 
 
 def _result(waiting: Any) -> dict[str, Any]:
