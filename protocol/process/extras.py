@@ -17,6 +17,7 @@ EXTRAS = {  # modules of each extra of pyproject.toml; a module of several stand
     "gym": ("gymnasium",),
     "identify": ("optuna",),
     "slurm": ("submitit",),
+    "metrics": ("prometheus_client",),
 }
 
 
