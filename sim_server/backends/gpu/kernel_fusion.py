@@ -154,8 +154,8 @@ class FusedKernel:
         self._launches = list(launches)  # keeps their arrays
         self._prologue_blocks = prologue.blocks if prologue else 0
         text = FusedSource(launches, self.shape, epilogue, private, guard, prologue, exact, opening)
-        others = (epilogue, prologue, opening)
-        self._arguments = (np.int32(self.items), *text.values, *(x.params for x in others if x))
+        parts: tuple[Epilogue | Prologue | Opening | None, ...] = (epilogue, prologue, opening)
+        self._arguments = (np.int32(self.items), *text.values, *(x.params for x in parts if x))
         folders = folder_options(*(launch.folder for launch in launches))
         flags = (*options(launches[0].types), *own_headers(), *folders)
         self._module = cupy().RawModule(code=text.source, options=flags, backend="nvrtc")
@@ -217,19 +217,19 @@ class FusedSource:
             lines.append(epilogue.text)
             self._parameters.append(f"const {epilogue.struct} epilogue")
             body_lines.append(f"{epilogue.function}(epilogue);")
-        opening = [f"const int block = (int)blockIdx.x - {prologue.blocks if prologue else 0};"]
+        begin = [f"const int block = (int)blockIdx.x - {prologue.blocks if prologue else 0};"]
         if prologue:
             lines.append(prologue.text)
             self._parameters.append(f"const {prologue.struct} prologue")
-            opening.append(f"if (block < 0) {{ {prologue.function}(prologue, blockIdx.x); return; }}")
+            begin.append(f"if (block < 0) {{ {prologue.function}(prologue, blockIdx.x); return; }}")
         if self._opening:
             lines.append(self._opening.text)
             self._parameters.append(f"const {self._opening.struct} opened")
-            opening.append(f"{self._opening.whole}(opened);")
+            begin.append(f"{self._opening.whole}(opened);")
         heading = f'extern "C" __global__ void __launch_bounds__({shape.threads}) fused(int n'
         parameters = "".join(f", {p}" for p in self._parameters)
-        opening += guard.lines if guard and not epilogue else []
-        lines += [f"{heading}{parameters}) {{", *opening, *self._setup, *body_lines, "}"]
+        begin += guard.lines if guard and not epilogue else []
+        lines += [f"{heading}{parameters}) {{", *begin, *self._setup, *body_lines, "}"]
         self.source = "\n".join(lines)
 
     def _each(self) -> Iterator[tuple[int, DeviceLaunch, str, str]]:
