@@ -32,6 +32,7 @@ from sim_server.network.link import ServerLink
 from sim_server.recording import messages
 from sim_server.recording.recorder import Recorder
 from sim_server.service.between_steps import BetweenSteps
+from sim_server.service.blades import Blades
 from sim_server.service.commands import Commands
 from sim_server.service.halts import Halts
 from sim_server.service.pace import LOOK_PERIOD, PaceMonitor
@@ -85,7 +86,7 @@ class Service:
         self._halts = Halts(self.commands)
         self._between = BetweenSteps(self.engine.loop)
         self._start = Start(simulation)
-        self._tearing = Tearing(simulation)
+        self._tearing, self._blades = Tearing(simulation), Blades(simulation)
         self._sets: deque[tuple[pb.Command, Callable[[pb.Reply], None]]] = deque()  # that set parameters
         self._status_due = self._workers_due = self._pace_due = self._set_due = 0.0
         self.check_workers: Callable[[], None] = lambda: None  # called every WORKERS_PERIOD
@@ -169,6 +170,7 @@ class Service:
         self._carry_out()
         self._set_parameters()
         self._tearing.look()
+        self._blades.look()
         if self._between.may_run:
             self._drain()
             self._between.run()
@@ -274,6 +276,7 @@ class Service:
             self.simulation.touch.release_of(name, touching)
         now = [m.targets for m in self.simulation.movers]
         self._start.reset(name)
+        self._blades.restart()
         for mover, old, new in zip(self.simulation.movers, targets, now, strict=True):
             if moved := {k: pose for k, pose in new.items() if not np.array_equal(pose, old[k])}:
                 mover.restore(moved)

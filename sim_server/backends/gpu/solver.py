@@ -9,11 +9,12 @@ from numpy.typing import NDArray
 
 from protocol.factor import FactorPattern
 from sim_server.arrays import Int32, Int64
+from sim_server.backends.base import CutInput
 from sim_server.backends.compiler import SOURCES
 from sim_server.backends.gpu.correction import FactorCorrection
 from sim_server.backends.gpu.cupy_types import DeviceArray, KernelFunction
 from sim_server.backends.gpu.device import Gpu, compiled, options, own_headers
-from sim_server.backends.gpu.followed_rows import FollowedRows
+from sim_server.backends.gpu.followed_rows import FollowedRows, siblings
 from sim_server.backends.gpu.inverse.build_inverse import InverseBuilder, PartitionedInverse
 from sim_server.backends.gpu.inverse.device_plan import DevicePlan, shared_bytes
 from sim_server.backends.gpu.inverse.plan import plan
@@ -48,7 +49,7 @@ class PcgSolver:
     correction: of factors for grabs and contacts; None: they are not corrected
     errors: True for a scene whose solves estimate the errors of positions (iterate_error.cuh)
     budgets: True for a scene whose solves may end by their wall time (step_budget.cuh); they estimate errors, too
-    most_blocks: of A of each body, where bodies may be split while steps run; none: the pattern of A stays
+    cut: what tells of nodes that lose elements, and of copies where bodies may be split; None: no body can be cut
 
     followed: what follows the pattern of A then (`follow`), else None
     params: arguments of the kernel (PCG_ARGUMENTS)
@@ -63,12 +64,13 @@ class PcgSolver:
         self, gpu: Gpu, ranges: Sequence[tuple[int, int]], arrays: Mapping[str, NDArray[Any]], counter: DeviceArray,
         capacity: int, planes: int = 1, phases: Sequence[DeviceArray] = (), attempts: int = 0, contact: bool = False,
         between: bool = False, correction: FactorCorrection | None = None, errors: bool = False, budgets: bool = False,
-        most_blocks: Sequence[int] = (),
+        cut: CutInput | None = None,
     ):  # fmt: skip
         cp, processors = gpu.cp, gpu.properties["multiProcessorCount"]
         self.gpu, self.counter, self._capacity, self.planes, self._phases = gpu, counter, capacity, planes, phases
         self._attempts, self._contact, self._correction, self.errors = attempts, contact, correction, errors
-        self.budgets = budgets
+        self.budgets, self._cut = budgets, cut
+        most_blocks = cut.most_blocks if cut else ()
         self._twins = {name: gpu.twin(arrays[name]) for name in ("row_start", "values", "b", "y", "moving")}
         self.real = np.dtype(self._twins["values"].dtype)
         self._types = {"real": "float" if self.real == np.float32 else "double"}
@@ -107,8 +109,15 @@ class PcgSolver:
             "pool_counter": self.pool_counter, "results": self.results, "step": counter,
             "begun": cp.zeros(1, np.int64), "clocks": cp.zeros(len(ranges) * TRIAL_CLOCK.itemsize, np.uint8),
         }  # fmt: skip
-        if self.followed:
-            self._work["split_step"] = cp.zeros(len(ranges), np.int64)
+        if cut:
+            self._work["at_rest"] = gpu.twin(cut.at_rest)
+            assert self._work["at_rest"].dtype == self.real
+        if cut and cut.origin is not None and self.followed:
+            self._work |= {
+                "origin": gpu.twin(cut.origin, dtype=np.dtype(np.int32)), "sibling": cp.asarray(siblings(cut.origin)),
+                "split_step": cp.zeros(len(ranges), np.int64), "copied_step": cp.zeros(total, np.int64),
+                "spread_step": cp.zeros(total, np.int64), "copy_words": cp.zeros(9 * total, np.uint64),
+            }  # fmt: skip
         fixed = 5120 if correction else 2048  # bytes: shared memory that pcg.cu declares, and the driver's
         self._shared = (gpu.properties["sharedMemPerMultiprocessor"] // blocks - fixed - 1024) // 16 * 16
         self.params = self._arguments(total, assigned.pooled)
@@ -136,14 +145,15 @@ class PcgSolver:
         return self._work["clocks"]
 
     @property
-    def split_step(self) -> DeviceArray:
-        """Steps completed when each body was split last, (bodies,); there only where bodies may be split."""
-        return self._work["split_step"]
+    def split_memory(self) -> dict[str, DeviceArray]:
+        """What is noted of splits, by its names in SplitNotes; there only where bodies may be split."""
+        return {name: self._work[name] for name in ("origin", "split_step", "copied_step", "spread_step")}
 
-    def follow(self, row_start: Int32, columns: Int32) -> list[tuple[DeviceArray, NDArray[Any]]]:
-        """Returns the arrays that follow the pattern of A, and their contents for this one."""
+    def follow(self, row_start: Int32, columns: Int32, origin: Int32) -> list[tuple[DeviceArray, NDArray[Any]]]:
+        """Returns the arrays that follow the pattern of A, and their contents for this one. origin: as of CutInput"""
         assert self.followed is not None
-        return [(self._work[name], array) for name, array in self.followed.of(row_start, columns).items()]
+        found = self.followed.of(row_start, columns) | {"sibling": siblings(origin)}
+        return [(self._work[name], array) for name, array in found.items()]
 
     def forget_plans(self, patterns: Collection[int]) -> None:
         """Frees plans of factors of all but these patterns (FactorPattern.id), which no step may use any more."""
@@ -167,7 +177,8 @@ class PcgSolver:
                 *(["-DCONTACT_PASSES"] if self._contact else []), *(["-DCORRECTED"] if corrected else []),
                 *(["-DERRORS"] if self.errors and name == "pcg" else []),
                 *(["-DBUDGETS"] if self.budgets and name == "pcg" else []),
-                *(["-DSPLITS"] if self.followed else []),
+                *(["-DCUTS"] if self._cut and name == "pcg" else []),
+                *(["-DSPLITS"] if self.followed and name == "pcg" else []),
             ),
             backend="nvrtc",
             enable_cooperative_groups=True,
