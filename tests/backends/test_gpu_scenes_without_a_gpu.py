@@ -375,7 +375,7 @@ def test_a_body_that_is_split_has_the_arrays_of_one_that_began_so(cupy, law, key
         assert twin is None or (twin.dtype == like.dtype and np.array_equal(twin, like))
     assert sum(twin is not None and not np.array_equal(twin, old) for twin, old in zip(twins, before, strict=True)) > 5
     pattern = sim.system.row_start, sim.system.columns
-    lists = [*sim.engine.solver.follow(*pattern, sim.cutting.origin)]
+    lists = [*sim.engine.solver.follow(*pattern)]
     for array, contents in lists:
         assert array.dtype == contents.dtype and np.array_equal(array, contents)
     staged = sim.engine.stage([(each, each.copy()) for each in pattern])[0]

@@ -59,18 +59,5 @@ def changed_bodies(
     return found
 
 
-def siblings(origin: Int32) -> Int32:
-    """Returns for each node the next copy of the same node of the mesh, in their order, which that node's own entry
-    begins, (nodes,); -1: none. origin (nodes,): node that each was copied from, itself, or -1."""
-    found, last = np.full(len(origin), -1, np.int32), np.arange(len(origin))
-    for copy in np.flatnonzero((origin >= 0) & (origin != np.arange(len(origin)))):
-        root = int(origin[copy])
-        while origin[root] != root:
-            root = int(origin[root])
-        found[last[root]] = copy
-        last[root] = copy
-    return found
-
-
 def _padded(values: NDArray[np.int32], size: int) -> NDArray[np.int32]:
     return np.concatenate([values, np.zeros(size - len(values), np.int32)])

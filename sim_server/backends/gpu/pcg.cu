@@ -40,9 +40,6 @@ struct BlockMemory {  // static shared memory of a thread block: data that is th
     real* diagonal;                // (own, 9) inverses of the diagonal blocks
     double peak;                   // largest scale
     int next, bad, rests;
-#ifdef SPLITS
-    int shares;                    // the body was split since the matrix of the factor
-#endif
     double b2, goal, quarter, rz;  // of the iteration; all threads write the same values
     PcgResult out;
 #ifdef CONTACT_PASSES
@@ -140,10 +137,9 @@ struct PcgSolver {
         const BlockRows& rows = memory.rows;
         for (int k = threadIdx.x; k < rows.halo; k += THREADS) {
             int node = rows.nodes[k];
-#ifdef CUTS
-            rows.place[k] = packed ? packed_place(node) : 3 * (memory.body.first + node);
-#else
             rows.place[k] = packed ? memory.plan.place[node] : 3 * (memory.body.first + node);
+#ifdef CUTS
+            if (packed && s.at_rest[memory.body.first + node] != 0) rows.place[k] |= APART;
 #endif
         }
         __syncthreads();
@@ -156,98 +152,24 @@ struct PcgSolver {
     }
 
     // Writes d r of an own degree of freedom for all thread blocks.
-    __device__ __forceinline__ void publish(int half, int k, real r) const { put_own(residuals(half), half, k, r); }
-    __device__ __forceinline__ void publish_product(int k, real q) const { put_own(memory.inverse.product, 0, k, q); }
+    __device__ __forceinline__ void publish(int half, int k, real r) const { put_own(residuals(half), k, r); }
+    __device__ __forceinline__ void publish_product(int k, real q) const { put_own(memory.inverse.product, k, q); }
 
-    // copies: which of the words that copies have is used, where the body was split
-    __device__ __forceinline__ void put_own(FlagWord<float>* to, [[maybe_unused]] int copies, int k, real v) const {
+    __device__ __forceinline__ void put_own(FlagWord<float>* to, int k, real v) const {
         float scaled = (float)(scale_of(k) * v);
 #ifdef CUTS
-        const int at = memory.rows.place[k / 3];
-        if (at & APART) scaled = 0;
-#endif
-#ifdef SPLITS
-        if (at & SHARED) return;  // once all copies have told theirs
-        if (at & COPIED) {
-            words_of_copies(copies)[3ll * (memory.body.first + memory.rows.begin) + k].put(scaled, group.number);
-            to[memory.plan.place[memory.rows.begin + k / 3] + k % 3].put(0, group.number);
-            return;
-        }
+        if (memory.rows.place[k / 3] & APART) scaled = 0;
 #endif
         to[memory.rows.position(k / 3) + k % 3].put(scaled, group.number);
     }
 
-#ifdef CUTS
-    __device__ __forceinline__ int packed_place(int node) const {
-        const int i = memory.body.first + node, apart = s.at_rest[i] != 0 ? APART : 0;
-#ifdef SPLITS
-        if (memory.shares) {
-            const int known = known_node(s, i, memory.body.factor_step);
-            const int flag = known != i ? COPIED : is_shared(s, i, memory.body.factor_step) ? SHARED : 0;
-            return memory.plan.place[known - memory.body.first] | flag | apart;
-        }
-#endif
-        return memory.plan.place[node] | apart;
-    }
-#endif
-
-#ifdef SPLITS
-    __device__ __forceinline__ FlagWord<float>* words_of_copies(int which) const { return s.copy_words + 3ll * s.nodes * which; }
-
-    // Writes what `put_own` has left out, of a whole vector: at nodes with copies, with those of the copies. at(k): its own entry k.
-    template <class At>
-    __device__ __forceinline__ void put_shared(FlagWord<float>* to, int copies, At at) const {
-        if (!memory.shares) return;
-        __syncthreads();
-        const BlockRows& rows = memory.rows;
-        for (int k = threadIdx.x; k < 3 * rows.own; k += THREADS) {
-            if (!(rows.place[k / 3] & SHARED)) continue;
-            const int i = memory.body.first + rows.begin + k / 3;
-            double sum = rows.place[k / 3] & APART ? 0 : (float)(scale_of(k) * at(k));
-            for (int copy = first_copy(s, i); copy >= 0; copy = s.sibling[copy]) {
-                if (s.origin[copy] < 0 || known_node(s, copy, memory.body.factor_step) != i) continue;
-                float v;
-                for (unsigned spins = 0; keep_polling(!words_of_copies(copies)[3ll * copy + k % 3].get(v, group.number), spins);) {}
-                sum += v;
-            }
-            to[rows.position(k / 3) + k % 3].put((float)sum, group.number);
-        }
-    }
-
-    // Writes what the inverses of own blocks add to z at copies and the nodes in their place; returns this thread's part of z . r.
-    __device__ __forceinline__ double put_own_blocks() const {
-        const BlockRows& rows = memory.rows;
-        double mine = 0;
-        for (int k = threadIdx.x; k < 3 * rows.own; k += THREADS) {
-            const int at = rows.place[k / 3];
-            if (at & APART || !(at & (COPIED | SHARED))) continue;
-            const real *r = rows.r + k / 3 * 3, *v = memory.diagonal + 3 * k;
-            const float z = (float)(v[0] * r[0] + v[1] * r[1] + v[2] * r[2]);
-            words_of_copies(2)[3ll * (memory.body.first + rows.begin) + k].put(z, group.number);
-            mine += (double)z * (double)rows.r[k];
-        }
-        return mine;
-    }
-#endif
-
     // z at entry k of the halo, by what P has made there.
     __device__ __forceinline__ float applied(const BlockRows& rows, int k, float z) const {
-#ifdef CUTS
-        const int at = rows.place[k / 3];
-#ifdef SPLITS
-        if (!(at & APART) && at & (COPIED | SHARED)) {
-            float more;
-            const FlagWord<float>* word = words_of_copies(2) + 3ll * (memory.body.first + rows.nodes[k / 3]) + k % 3;
-            for (unsigned spins = 0; keep_polling(!word->get(more, z_number), spins);) {}
-            z += more;
-        }
-#endif
-#endif
 #ifdef CORRECTED
         if (corrects) z -= correction_at(rows, k);
 #endif
 #ifdef CUTS
-        if (at & APART) z = 0;
+        if (rows.place[k / 3] & APART) z = 0;
 #endif
         return z;
     }
@@ -291,12 +213,6 @@ struct PcgSolver {
             publish(turn, k, bk);
             publish(1 - turn, k, (real)rk);  // not b - A x from float words, which near the solution would be rounding errors
         });
-#ifdef SPLITS
-        if (packed) {
-            put_shared(residuals(turn), turn, [&](int k) { return rows.r[k]; });
-            put_shared(residuals(1 - turn), 1 - turn, [&](int k) { return (real)((double)rows.r[k] - (double)rows.q[k]); });
-        }
-#endif
         r_number = group.number;
         into_three<2>(mine);
 #ifdef CORRECTED
@@ -459,9 +375,6 @@ struct PcgSolver {
             rows.q[k] = q;
             if (packed) publish_product(k, q);
         });
-#ifdef SPLITS
-        if (packed) put_shared(memory.inverse.product, 0, [&](int k) { return rows.q[k]; });
-#endif
         q_number = group.number;
         into_three<4>(mine);
 #ifdef ERRORS
@@ -499,16 +412,7 @@ struct PcgSolver {
 #endif
         z_number = group.number;
         if (kind == CHOLESKY) {
-#ifdef SPLITS
-            double added = 0;
-            if (memory.shares) {
-                put_shared(residuals(1 - turn), 1 - turn, [&](int k) { return rows.r[k]; });
-                added = put_own_blocks();
-            }
-            mine[0] = by_inverse(alpha, r2) + added;
-#else
             mine[0] = by_inverse(alpha, r2);
-#endif
 #ifdef CORRECTED
             if (column >= 0) keep_column();
 #endif
@@ -598,9 +502,6 @@ struct PcgSolver {
         bool known = packed && then >= 0 && then < step;
 #ifdef CONTACT_PASSES
         known &= memory.contact.phase != CHOOSE_START;
-#endif
-#ifdef SPLITS
-        known &= !memory.shares;  // columns are of what is applied
 #endif
         double large = 0;
         for (int k = threadIdx.x; k < rows.own; k += THREADS) {
@@ -748,9 +649,6 @@ struct PcgSolver {
         __syncthreads();
         if (packed) {
             for (int k = threadIdx.x; k < 3 * memory.rows.own; k += THREADS) publish(turn, k, memory.rows.r[k]);
-#ifdef SPLITS
-            put_shared(residuals(turn), turn, [&](int k) { return memory.rows.r[k]; });
-#endif
             r_number = group.number;
             group.barrier();
         } else {
@@ -792,11 +690,7 @@ __device__ __forceinline__ void PcgSolver::solve() {
     bool prepares = false;
     int made = 0;  // columns of V
 #endif
-#ifdef SPLITS
-    if (kind == JACOBI || kind == BLOCK_JACOBI || memory.shares) invert_diagonal(kind != JACOBI);
-#else
     if (kind == JACOBI || kind == BLOCK_JACOBI) invert_diagonal(kind == BLOCK_JACOBI);
-#endif
     for (;;) {
         if (measure) {  // the true residual
             double bb;
@@ -992,7 +886,7 @@ __device__ __forceinline__ void solve_body(const PcgArguments& s, const RowRange
     if (threadIdx.x == THREADS - 1) memory.rests = s.moving[k] == 0;
 #ifdef SPLITS
     __syncthreads();
-    if (threadIdx.x == 0) memory.shares = memory.body.plan && memory.body.factor_step < s.split_step[k];
+    if (threadIdx.x == 0 && memory.body.factor_step < s.split_step[k]) memory.body.plan = nullptr;  // of another pattern
 #endif
 #ifdef CONTACT_PASSES
     if (threadIdx.x == 0) memory.contact = pass.state[k];

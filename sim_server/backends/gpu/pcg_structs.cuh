@@ -99,11 +99,6 @@ struct PcgArguments {
     TrialClock* clocks;            // (bodies,)
     const int* moving;             // (bodies,) 0: the body rests (kernels/nodes.cu)
     const real* at_rest;           // -DCUTS: (nodes,) 1 at nodes without elements (cut_nodes.cuh)
-    const long long* split_step;   // -DSPLITS: (bodies,) steps completed when the body was split last
-    const int* origin;             // -DSPLITS: (nodes,) node that each was copied from, itself, or -1 (effects/cutting_split.cu)
-    const int* sibling;            // -DSPLITS: (nodes,) next copy of the same node of the mesh, whose own is the first one; -1: none
-    const long long* copied_step;  // -DSPLITS: (nodes,) steps completed when the node was copied from another
-    const long long* spread_step;  // -DSPLITS: (nodes,) likewise when it was copied last, or a copy of it
-    FlagWord<float>* copy_words;   // -DSPLITS: (3, nodes, 3) d r of copies, of two vectors; what own blocks add to z
+    const long long* split_step;   // -DSPLITS: (bodies,) steps completed when the body was split last: older factors are not used
     int nodes, shared;             // of the scene; bytes of dynamic shared memory
 };

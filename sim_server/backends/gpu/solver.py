@@ -14,7 +14,7 @@ from sim_server.backends.compiler import SOURCES
 from sim_server.backends.gpu.correction import FactorCorrection
 from sim_server.backends.gpu.cupy_types import DeviceArray, KernelFunction
 from sim_server.backends.gpu.device import Gpu, compiled, options, own_headers
-from sim_server.backends.gpu.followed_rows import FollowedRows, siblings
+from sim_server.backends.gpu.followed_rows import FollowedRows
 from sim_server.backends.gpu.inverse.build_inverse import InverseBuilder, PartitionedInverse
 from sim_server.backends.gpu.inverse.device_plan import DevicePlan, shared_bytes
 from sim_server.backends.gpu.inverse.plan import plan
@@ -49,7 +49,7 @@ class PcgSolver:
     correction: of factors for grabs and contacts; None: they are not corrected
     errors: True for a scene whose solves estimate the errors of positions (iterate_error.cuh)
     budgets: True for a scene whose solves may end by their wall time (step_budget.cuh); they estimate errors, too
-    cut: what tells of nodes that lose elements, and of copies where bodies may be split; None: no body can be cut
+    cut: what tells of nodes that lose elements, and how many blocks A has at most; None: no body can be cut
 
     followed: what follows the pattern of A then (`follow`), else None
     params: arguments of the kernel (PCG_ARGUMENTS)
@@ -112,12 +112,8 @@ class PcgSolver:
         if cut:
             self._work["at_rest"] = gpu.twin(cut.at_rest)
             assert self._work["at_rest"].dtype == self.real
-        if cut and cut.origin is not None and self.followed:
-            self._work |= {
-                "origin": gpu.twin(cut.origin, dtype=np.dtype(np.int32)), "sibling": cp.asarray(siblings(cut.origin)),
-                "split_step": cp.zeros(len(ranges), np.int64), "copied_step": cp.zeros(total, np.int64),
-                "spread_step": cp.zeros(total, np.int64), "copy_words": cp.zeros(9 * total, np.uint64),
-            }  # fmt: skip
+        if self.followed:
+            self._work["split_step"] = cp.zeros(len(ranges), np.int64)
         fixed = 5120 if correction else 2048  # bytes: shared memory that pcg.cu declares, and the driver's
         self._shared = (gpu.properties["sharedMemPerMultiprocessor"] // blocks - fixed - 1024) // 16 * 16
         self.params = self._arguments(total, assigned.pooled)
@@ -145,15 +141,14 @@ class PcgSolver:
         return self._work["clocks"]
 
     @property
-    def split_memory(self) -> dict[str, DeviceArray]:
-        """What is noted of splits, by its names in SplitNotes; there only where bodies may be split."""
-        return {name: self._work[name] for name in ("origin", "split_step", "copied_step", "spread_step")}
+    def split_step(self) -> DeviceArray:
+        """Steps completed when each body was split last, (bodies,); there only where bodies may be split."""
+        return self._work["split_step"]
 
-    def follow(self, row_start: Int32, columns: Int32, origin: Int32) -> list[tuple[DeviceArray, NDArray[Any]]]:
-        """Returns the arrays that follow the pattern of A, and their contents for this one. origin: as of CutInput"""
+    def follow(self, row_start: Int32, columns: Int32) -> list[tuple[DeviceArray, NDArray[Any]]]:
+        """Returns the arrays that follow the pattern of A, and their contents for this one."""
         assert self.followed is not None
-        found = self.followed.of(row_start, columns) | {"sibling": siblings(origin)}
-        return [(self._work[name], array) for name, array in found.items()]
+        return [(self._work[name], array) for name, array in self.followed.of(row_start, columns).items()]
 
     def forget_plans(self, patterns: Collection[int]) -> None:
         """Frees plans of factors of all but these patterns (FactorPattern.id), which no step may use any more."""
@@ -178,7 +173,7 @@ class PcgSolver:
                 *(["-DERRORS"] if self.errors and name == "pcg" else []),
                 *(["-DBUDGETS"] if self.budgets and name == "pcg" else []),
                 *(["-DCUTS"] if self._cut and name == "pcg" else []),
-                *(["-DSPLITS"] if self.followed and name == "pcg" else []),
+                *(["-DSPLITS"] if self.followed else []),
             ),
             backend="nvrtc",
             enable_cooperative_groups=True,

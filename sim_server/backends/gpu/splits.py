@@ -4,7 +4,7 @@
 Between two steps the loop copies new contents into the arrays of the scene that follow its parameters, as with every
 change of parameters, and with them lists of the solver, places of own blocks of the Newton iteration, and where the
 blocks of each body begin. Then two kernels begin the copies of nodes (effects/cutting_split.cu) and note which bodies
-got another pattern, and which nodes are new (note_splits.cu), by which the solver uses older factors.
+got another pattern (note_splits.cu), so that the solver uses no older factor.
 """
 
 from collections.abc import Sequence
@@ -59,20 +59,19 @@ class DeviceSplits:
     ):  # fmt: skip
         assert given.cut is not None and given.cut.spawn is not None
         self._gpu, self._solver, self._newton, self._ranges = gpu, solver, newton, given.ranges
-        assert given.cut.origin is not None
-        self._pattern, self._origin = (given.arrays["row_start"], given.arrays["columns"]), given.cut.origin
+        self._pattern = given.arrays["row_start"], given.arrays["columns"]
         self._block = 9 * gpu.twin(given.arrays["values"]).dtype.itemsize  # bytes
         self._spawn = cast(DeviceLaunch, given.cut.spawn)
-        bodies, zeros, own = len(given.ranges), gpu.cp.zeros, solver.split_memory
+        bodies, zeros = len(given.ranges), gpu.cp.zeros
         self._numbers = np.zeros(bodies, np.int64)  # of the patterns that were staged last
         self._known: tuple[Int32, Int32] = (self._pattern[0].copy(), self._pattern[1].copy())  # these patterns
         self._last: Staged | None = None  # what follows them
         self._memory: dict[str, DeviceArray] = {
             "number": zeros(bodies, np.int64), "noted": zeros(bodies, np.int64), "step": counter,
-            "origin_noted": own["origin"].copy(), **own,
+            "split_step": solver.split_step,
         }  # fmt: skip
         self._params = np.zeros((), SPLIT_NOTES)
-        self._params["bodies"], self._params["nodes"] = bodies, len(given.cut.origin)
+        self._params["bodies"] = bodies
         for name, array in self._memory.items():
             self._params[name] = array.data.ptr
         module = gpu.cp.RawModule(code=TEXT.checked(), options=options(gpu.types), backend="nvrtc")
@@ -87,14 +86,13 @@ class DeviceSplits:
         changed = changed_bodies(self._ranges, self._known, (row_start, columns))
         if self._last is None or changed.any():  # else what was staged last is the same, and may not have been taken up
             numbers = self._numbers + changed
-            origin = new.get(id(self._origin), self._origin)
-            self._last = self._made(row_start, columns, origin, numbers)  # may lack memory
+            self._last = self._made(row_start, columns, numbers)  # may lack memory
             self._numbers, self._known = numbers, (row_start.copy(), columns.copy())
         return self._last
 
-    def _made(self, row_start: Int32, columns: Int32, origin: Int32, numbers: Int64) -> Staged:
+    def _made(self, row_start: Int32, columns: Int32, numbers: Int64) -> Staged:
         contents: list[tuple[DeviceArray, NDArray[Any]]] = [(self._memory["number"], numbers)]
-        contents += self._solver.follow(row_start, columns, origin)
+        contents += self._solver.follow(row_start, columns)
         if self._newton:
             contents.append(self._newton.follow(row_start, columns))
         staged = Staged.of(self._gpu, contents)
@@ -106,9 +104,8 @@ class DeviceSplits:
         self._note((1,), (THREADS,), (self._params,))
 
     def state(self) -> list[StateArray]:
-        """Returns what steps carry on: what factors know of splits."""
-        names = ("split_step", "copied_step", "spread_step", "origin_noted")
-        return device_arrays("engine.splits", self._memory, *names)
+        """Returns what steps carry on: which factors are too old."""
+        return device_arrays("engine.splits", self._memory, "split_step")
 
 
 def places_of(ranges: Sequence[tuple[int, int]], row_start: Int32, block: int) -> NDArray[np.int64]:
