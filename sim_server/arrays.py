@@ -13,4 +13,5 @@ Int64 = NDArray[np.int64]
 def distinct(values: Int64) -> Int64:
     """Returns the different values, ascending: np.unique of integers, which takes many times as long by its hashes."""
     ordered = np.sort(values, axis=None)
-    return ordered[np.concatenate([np.ones(min(len(ordered), 1), bool), ordered[1:] != ordered[:-1]])]
+    first = np.concatenate([np.ones(min(len(ordered), 1), bool), ordered[1:] != ordered[:-1]])
+    return np.asarray(ordered[first])

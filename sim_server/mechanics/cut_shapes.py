@@ -38,7 +38,7 @@ def opened_by_blade(x: Float64, tets: Int32, owners: Int64, corners: Float64) ->
     met[met_by_blade(x, tets, corners)] = True
     faces = np.flatnonzero((owners >= 0).all(axis=1) & met[owners].any(axis=1))
     side = _sides(x[tets[owners[faces]]].mean(axis=2).reshape(-1, 3), corners).reshape(-1, 2)
-    return faces[side[:, 0] != side[:, 1]]
+    return np.asarray(faces[side[:, 0] != side[:, 1]])
 
 
 def border(chosen: Bools, owners: Int64) -> Int64:

@@ -26,9 +26,9 @@ class Blades:
     """
 
     def __init__(self, simulation: Simulation):
-        self._simulation, contact = simulation, simulation.contact
-        listed = contact.listed if contact is not None else []
-        self._edges = {k: np.array(o.edge) for k, o in enumerate(listed) if getattr(o, "edge", None)}
+        self._simulation = simulation
+        listed = simulation.scene.obstacles or []
+        self._edges = {k: np.array(o.edge) for k, o in enumerate(listed) if o.edge is not None}
         self._names = [o.name for o in listed]
         self._bodies = [b for b in simulation.world.bodies if "cutting" in b.effects] if self._edges else []
         lengths = [_mean_edge(b.mesh.rest[b.mesh.tets]) for b in self._bodies]
@@ -68,8 +68,8 @@ class Blades:
         """Returns the poses of all obstacles (m, 7); None while the loop is writing them."""
         contact = self._simulation.contact
         assert contact is not None
-        found = [contact.world.backend.fetch(contact.end).copy() for _ in range(2)]
-        return found[0] if np.array_equal(*found) else None
+        once, again = (contact.world.backend.fetch(contact.end).copy() for _ in range(2))
+        return again if np.array_equal(once, again) else None
 
     def _sweep(self, name: str, before: Float64, now: Float64) -> None:
         corners = [pb.Vector(x=x, y=y, z=z) for x, y, z in (before[0], before[1], now[1], now[0])]
