@@ -191,7 +191,12 @@ def _serve(
         observe = (lambda seconds: None) if collected is None else collected.factorization.observe
         return Worker(connected, partial(make_factorization, library=library), on_server, observe)
 
-    with closing, MainLoop(where, shared_memory, connection, worker) as serving:
+    def left(connected: ServerConnection) -> None:
+        print(f"precond-worker {name}: leaves server {connected.server}, others need it more", flush=True)
+        if collected is not None:
+            collected.connections.remove(connected)
+
+    with closing, MainLoop(where, shared_memory, connection, worker, name, left) as serving:
         serving.run()
 
 

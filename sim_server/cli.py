@@ -320,7 +320,7 @@ def _serve_metrics(closing: ExitStack, service: "Service", host: str, port: int)
     from sim_server.service.metrics import ServerMetrics
 
     names = [body.name for body in service.simulation.world.bodies]
-    found = ServerMetrics(names, service.link, service.recorder)
+    found = ServerMetrics(names, service.link, service.recorder, lambda: service.need.lost)
     closing.enter_context(MetricsServer(host, port, found, service.health.why_not))
     service.telemetry.metrics = found
     service.telemetry.publish_status("running")
