@@ -216,7 +216,7 @@ def library_title(library: str) -> str:
         try:
             native()
         except CompileError as error:
-            PROGRAM.bad_input(f"complete factors without scikit-sparse need a C++ compiler: {error}")
+            PROGRAM.bad_input(f"complete factors need a C++ compiler: {error}")
     return name
 
 
