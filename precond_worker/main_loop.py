@@ -37,7 +37,9 @@ class _Served(NamedTuple):
 class MainLoop:
     """Connects to all addresses and serves the servers there in turn. Raises NameTaken from `step`.
 
-    name: of this worker. left: called with the connection to a server of a pool that is served no more
+    name: of this worker
+    left: called with the connection to a server of a pool that is served no more
+    alive: called between two jobs, and every second or so
     """
 
     def __init__(
@@ -48,8 +50,10 @@ class MainLoop:
         worker: MakeWorker,
         name: str = "",
         left: Callable[[ServerConnection], None] = lambda connection: None,
+        alive: Callable[[], None] = lambda: None,
     ):
         self._connection, self._worker, self._name, self._left = connection, worker, name, left
+        self._alive = alive
         self._round_robin = RoundRobin(threading.Event())
         self._pools: list[tuple[Pool, ServerAddress, Session]] = []
         self._served: dict[str, _Served] = {}  # by name, of pools
@@ -63,6 +67,7 @@ class MainLoop:
         """Works until an exception such as KeyboardInterrupt."""
         while True:
             self.step(1.0)
+            self._alive()
 
     def step(self, timeout: float) -> None:
         """Serves new servers, takes in what was received, and does one job."""

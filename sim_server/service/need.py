@@ -43,4 +43,4 @@ class NeedMeter:
         if state.frozen or without or solves.iteration_cost.value is None:
             return 0.0
         cost = solves.iteration_cost.value / (BYTES if state.counted else 1.0)
-        return solves.latest * cost / 2 ** min(state.failures.in_a_row, 30)
+        return float(solves.latest * cost / 2 ** min(state.failures.in_a_row, 30))
