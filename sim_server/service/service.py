@@ -37,6 +37,7 @@ from sim_server.service.blades import Blades
 from sim_server.service.commands import Commands
 from sim_server.service.halts import Halts
 from sim_server.service.health import Health
+from sim_server.service.need import NeedMeter
 from sim_server.service.pace import LOOK_PERIOD, PaceMonitor
 from sim_server.service.tearing import Tearing
 from sim_server.service.telemetry import Telemetry
@@ -104,6 +105,7 @@ class Service:
         self._last = None if steps is None else self.engine.step + steps
         self.telemetry.open(resume)
         self.health = Health(Notifier())
+        self.need = NeedMeter(self.driver)
 
     def _first_factors(self, realtime: bool) -> FirstFactors | None:
         """Returns the first factors that the first step waits for; None: it goes without."""
@@ -184,6 +186,8 @@ class Service:
         self.commands.release_absent(set(self.link.clients()))
         self.health.look(self.engine.step, self.commands.engine_paused or self._first is not None)
         self.telemetry.publish_status(self._state(), force=False)
+        if self.need.look():
+            self.link.publish_need(self.need.lost)
 
     def _carry_out(self) -> None:
         """Carries out all commands that wait; answers them once the loop has what they change."""
