@@ -9,7 +9,7 @@ import ctypes as c
 import time
 import weakref
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from typing import Any, cast
 
@@ -50,7 +50,7 @@ def _library() -> c.CDLL:
         {
             "wf_assemble": (None, [loop]), "wf_solve": (None, [loop]), "wf_run": (c.c_int64, [loop, c.c_int64]),
             "wf_wait": (c.c_int32, [loop]), "wf_restart": (None, [loop, c.c_int32]),
-            "wf_copy_matrix": (None, [loop, c.c_int32, p]),
+            "wf_copy_matrix": (None, [loop, c.c_int32, p]), "wf_note_matrix": (None, [loop, c.c_int32]),
             "wf_post_factor": (p, [c.POINTER(structs.Body), p]), "wf_post_binding": (p, [c.POINTER(structs.Launch), p]),
             "wf_post_changes": (p, [loop, p]), "wf_take_changes": (None, [loop]),
             "wf_apply_factor": (None, [c.POINTER(structs.Factor), p, p, p, c.c_int32]),
@@ -431,6 +431,38 @@ class _NativeContact:
         native.body = c.addressof(self._references)
 
 
+class _NativeRefresh:
+    """What A of a body had on its diagonal when copies were taken, and room to solve directly where it changed most."""
+
+    def __init__(self, body: Any, blocks: int):
+        n = body.last - body.first
+        capacity = min(WIDEST_CUT * blocks, LARGEST_CUT)
+        self.carried: dict[str, NDArray[Any]] = {
+            "step": np.full(KNOWN_DIAGONALS, -1, np.int64), "block": np.zeros((KNOWN_DIAGONALS, n, 6), np.float32)
+        }  # fmt: skip
+        self._room: dict[str, NDArray[Any]] = {
+            "at_rest": np.zeros(n), "changed_at": np.zeros(n), "free": np.ones(n), "node": np.zeros(n, np.int32),
+            "place": np.zeros(n, np.int32), "first": np.zeros(3 * n, np.int32), "row": np.zeros(3 * n, np.int64),
+            "envelope": np.zeros(capacity), "t": np.zeros(3 * n), "room": np.zeros(3 * n),
+        }  # fmt: skip
+        self._score = np.zeros(n)
+        self._nodes = structs.CutNodes(nodes=n, capacity=capacity)
+        for name, array in self._room.items():
+            setattr(self._nodes, name, array.ctypes.data)
+        self.native = structs.KnownDiagonals(
+            kept=KNOWN_DIAGONALS, score=self._score.ctypes.data, room=c.addressof(self._nodes),
+            **{name: array.ctypes.data for name, array in self.carried.items()},
+        )  # fmt: skip
+        body.correction.known = c.addressof(self.native)
+
+    def state(self, name: str) -> list[StateArray]:
+        """Returns what steps carry on; no reset takes it back."""
+        arrays = [host_array(f"{name}.{k}", a, resets=False) for k, a in self.carried.items()]
+        return [replace(a, added=True) for a in (numbers_array(f"{name}.numbers", self.native), *arrays)]
+
+
+REFRESHED_NODES = 500  # of a body from which on its factors may be refreshed
+KNOWN_DIAGONALS = 8  # copies of a body that are remembered: more than are under way at a time
 LARGEST_CUT = 4_000_000  # entries of the envelope
 WIDEST_CUT = 30 * 9  # as ENOUGH_FOR_CUTS of native/cut_nodes.h, in numbers of A a block
 
@@ -534,6 +566,12 @@ class CpuEngine(Reports):
             self._contact.native.predictor = given.euler.start_v.ctypes.data
         elif self._contact and self._newton:
             self._contact.native.predictor = self._newton.search_in_contact(bodies).ctypes.data
+        starts = arrays["row_start"]
+        self._refresh = {
+            i: _NativeRefresh(entry, int(starts[entry.last] - starts[entry.first]))
+            for i, entry in enumerate(self._body)
+            if entry.last - entry.first >= REFRESHED_NODES and given.solver.preconditioner in ("auto", "cholesky")
+        }
         self._cut: dict[int, _NativeCut] = {}
         if given.cut and given.solver.wants_factors:
             self._cut = {i: _NativeCut(given.cut, self._body[i], given.dt, arrays) for i in given.cut.bodies}
@@ -575,6 +613,7 @@ class CpuEngine(Reports):
         To be called between `assemble` and `solve`.
         """
         entry, start = self._body[body], self._arrays["row_start"]
+        self._native.wf_note_matrix(c.byref(self.loop), body)
         values: Reals = self._arrays["values"][start[entry.first] : start[entry.last]]
         if not self._contact:
             return values
@@ -615,7 +654,8 @@ class CpuEngine(Reports):
             host_array("engine.balance", self._energies.balance.view(np.uint8), resets=False),
             host_array("engine.clock", self._arrays["clock"], resets=False),
         ]
-        return [*own, *(a for part in parts for a in part), *(a for part in corrections for a in part)]
+        known = [refresh.state(f"engine.known{k}") for k, refresh in self._refresh.items()]
+        return [*own, *(a for part in (*parts, *corrections, *known) for a in part)]
 
     def _state_of_correction(self, body: int) -> list[StateArray]:
         """Returns what is known of the changes since the matrix of the factor in use. No reset takes it back."""
@@ -701,6 +741,15 @@ class CpuEngine(Reports):
         """Number of nodes at which the last solve corrected the factor in use. A probe for tests; only while the loop
         stands still."""
         return int(self._body[body].correction.used)
+
+    def forget_matrices(self, body: int) -> None:
+        """Has no factor of the body refreshed from now on. For benchmarks; only while the loop stands still."""
+        self._body[body].correction.known = None
+
+    def refreshed(self, body: int) -> int:
+        """Number of nodes on which the last solve was exact beside its factor. A probe for tests; only while the loop
+        stands still."""
+        return int(self._refresh[body].native.refreshed) if body in self._refresh else 0
 
     def cut_nodes(self, body: int) -> tuple[int, int, int]:
         """Nodes that lost elements since the matrix of the factor in use, with neighbours; those that the last solve

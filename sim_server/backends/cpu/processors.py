@@ -34,9 +34,9 @@ def quota() -> float:
     found = math.inf
     for _, controllers, path in (group for group in groups if len(group) == 3):
         if not controllers:
-            root, files = CGROUPS, ("cpu.max",)
+            root, files = CGROUPS, ["cpu.max"]
         elif "cpu" in controllers.split(","):
-            root, files = CGROUPS / "cpu", ("cpu.cfs_quota_us", "cpu.cfs_period_us")
+            root, files = CGROUPS / "cpu", ["cpu.cfs_quota_us", "cpu.cfs_period_us"]
         else:
             continue
         own = root / path.lstrip("/")

@@ -29,6 +29,7 @@ from sim_server.simulation import Simulation
 from sim_server.updates.driver import Driver
 from sim_server.updates.first_factors import FirstFactors
 from tests.bench.cpu import threads as several
+from tests.bench.cpu import transients
 from tests.bench.cpu.scipy_step import ScipyStep
 from tests.bench.harness.pieces import Merged, Piece, arguments_of_pieces, say, shown
 from tests.bench.harness.report import ROOT, Report, plots
@@ -37,7 +38,7 @@ SCENE = ROOT / "deploy" / "scenes" / "sofa_beam.toml"
 CELLS = {540: (3, 3, 10), 3000: (5, 5, 20), 7350: (7, 7, 25), 24000: (10, 10, 40), 98304: (16, 16, 64)}
 STEPS = {540: 300, 3000: 300, 7350: 150, 24000: 100}
 FIRST_STEPS = 100
-TITLE, PARTS = "A step on a CPU", ("schemes", "first", "threads")
+TITLE, PARTS = "A step on a CPU", ("schemes", "first", "threads", "transients")
 # CPU ms per step of the simulation thread measured for SOFA v17.06 with the logic of its asynchronous solver (2.5 GHz
 # Cascade Lake class, dgemm 1000 at 35 ms on one thread), and what we aimed at.
 SOFA = {540: 1.1, 3000: 5.95, 7350: 29.4, 24000: 134.0}
@@ -259,18 +260,25 @@ def main() -> None:
     if o.merge:
         merged = Merged("cpu", TITLE, o.merge, o.out)
         keys = {"rows": ("tets", "scheme"), "first steps": ("tets", "first_factor"), "threads": ("tets", "threads")}
+        keys["transients"] = ("tets", "threads", "factor")
         merged.data |= {section: merged.rows(section, names) for section, names in keys.items()}
         write(merged)
         return
     arguments: dict[str, Any] = {"only": o.only} if len(o.only) < len(PARTS) else {}
+    o.threads = usable(o.threads)
     if "threads" in o.only:
-        o.threads = usable(o.threads)
         arguments |= {"threads": o.threads, "thread sizes": o.thread_sizes}
     if {"schemes", "first"} & set(o.only):
         arguments |= {"sizes": o.sizes, "rounds": o.rounds}
     report, share = Piece("cpu", TITLE, arguments, o.out, o.quick), 0.1 if o.quick else 1.0
     if "threads" in o.only:
         report.data["threads"] = thread_rows(o.thread_sizes, o.threads, share)
+        report.keep()
+    if "transients" in o.only:
+        tets, steps = (540, 64) if o.quick else (24000, 128)
+        report.data["transients"] = [row for n in {1, max(o.threads)} for row in transients.measure(tets, steps, n)]
+        for row in report.data["transients"]:
+            say(shown(row))
         report.keep()
     if "schemes" in o.only:
         report.data["rows"] = measure(o.sizes, o.rounds, share)
@@ -297,6 +305,8 @@ def write(report: Report) -> None:
         report.remember(threads, ("tets", "threads"), ("ms p50", "p99"))
         several.tell(report, threads)
         several.draw(report, threads)
+    if old := report.data.get("transients"):
+        transients.tell(report, old)
     if rows:
         draw(report, rows)
     report.write()

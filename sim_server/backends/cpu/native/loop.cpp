@@ -119,6 +119,7 @@ static void copy_for_worker(Loop& loop, Body& body) {
     const int64_t index = &body - loop.body;
     const bool assembled = loop.stages ? loop.stages->state[index].assembled : !loop.euler || loop.euler->assembled[index];
     if (body.ahead < 0 && !assembled) return;  // in the next step
+    if (assembled) note_diagonal(body.correction.known, matrix_of(loop, body), loop.rings.step);
     if (body.ahead < 0) {
         copy_matrix(loop, body, target);
     } else {
@@ -369,6 +370,10 @@ void wf_solve(Loop* loop) {
     if (loop->energies) leave(*loop);
 }
 
+// Has the loop know of what matrix a factor will be made.
+void wf_note_matrix(Loop* loop, int32_t body) {
+    note_diagonal(loop->body[body].correction.known, matrix_of(*loop, loop->body[body]), loop->rings.step);
+}
 void wf_copy_matrix(Loop* loop, int32_t body, double* target) { copy_matrix(*loop, loop->body[body], target); }
 int32_t wf_wait(Loop* loop) { return wait_until_due(loop->rings, [] { return false; }); }
 

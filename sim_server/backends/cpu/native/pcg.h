@@ -69,10 +69,11 @@ struct Preconditioner {
     void* work;       // 2 n doubles
     double omega;
     Correction* correction = nullptr;
-    bool corrects = false, cut = false;
+    bool corrects = false;
+    CutNodes* around = nullptr;  // nodes on which it is exact
 
     void prepare() {
-        cut = kind == CHOLESKY && correction && correction->cut && is_cut();
+        around = kind == CHOLESKY && correction && correction->cut && is_cut() ? correction->cut : nullptr;
         corrects = kind == CHOLESKY && correction && correction->capacity && Corrected{*correction, A, *factor}.prepare();
         if (kind == JACOBI || kind == BLOCK_JACOBI || kind == SSOR) invert_diagonal(A, kind != JACOBI, inverse);
     }
@@ -87,14 +88,22 @@ struct Preconditioner {
         return dot(A, z, r);
     }
     bool is_cut() {
-        CutSolve around{*correction->cut, A};
-        around.prepare(factor->step);
-        return around.works();
+        CutSolve solve{*correction->cut, A};
+        solve.prepare(factor->step);
+        return solve.works();
+    }
+    // Makes it exact where A has changed most since the factor's matrix (local_refresh.h); false if that cannot be.
+    bool refresh_locally() {
+        if (around || !correction) return false;
+        const double numbers = entries_of(*factor->pattern) + 9.0 * (A.row_start[A.last] - A.row_start[A.first]);
+        if (!refresh(correction->known, A, factor->step, numbers)) return false;
+        around = correction->known->room;
+        return true;
     }
     template <class T>
     double with_factor(const double* r, double r_norm, double* z) {
-        if (!cut) return apply_alone<T>(r, r_norm, z);
-        CutSolve{*correction->cut, A}.around(r, z, [&](const double* from, double* to) { apply_alone<T>(from, r_norm, to); });
+        if (!around) return apply_alone<T>(r, r_norm, z);
+        CutSolve{*around, A}.around(r, z, [&](const double* from, double* to) { apply_alone<T>(from, r_norm, to); });
         return dot(A, z, r);
     }
     template <class T>
@@ -147,10 +156,12 @@ static SolveResult pcg(const BlockCsr& A, const double* b, const Factor* factor,
 
     Preconditioner P{A, factor, out.kind, inverse, scratch, settings.omega, correction};
     P.prepare();
+    if (correction && correction->known) correction->known->refreshed = 0;
     const double useful = bounded ? std::max(goal, USEFUL * USEFUL * b2) : goal;
     const double limit = settings.residual_limit > 0 ? settings.residual_limit * settings.residual_limit * b2 : INFINITY;
     double rz = 0, last_true = INFINITY, quarter = r2 * std::pow(useful / r2, 0.25);
-    bool restart = true, switched = false, applied = from == APPLIED_START;
+    const double first_r2 = r2;
+    bool restart = true, switched = false, refreshed = false, applied = from == APPLIED_START;
     auto leave_factor = [&] {
         P.kind = out.kind = BLOCK_JACOBI;
         out.fallbacks = 1;
@@ -161,6 +172,11 @@ static SolveResult pcg(const BlockCsr& A, const double* b, const Factor* factor,
     // Whether a solve ends by the estimate. ahead: z is of the iteration before.
     auto is_enough = [&](bool ahead) {
         return bounded && r2 <= limit && may_end(out.kind, r2, b2) && error.is_enough(settings.dx_dv, trust_of(out.kind, settings.trust), settings.position, r2, ahead);
+    };
+    // Whether a solve with a factor has far to go: then the factor is refreshed where A has changed most.
+    auto is_slow = [&] {
+        if (refreshed || P.kind != CHOLESKY || out.iterations != REFRESH_AFTER || bounded) return false;
+        return !(REFRESH_AFTER * std::log(r2 / goal) < REFRESH_WORTH * std::log(first_r2 / r2));
     };
     // The status with which the solve ends by its true residual, -1: it goes on from it.
     auto ended = [&](bool enough) {
@@ -214,7 +230,13 @@ static SolveResult pcg(const BlockCsr& A, const double* b, const Factor* factor,
         r2 = descend(A, rz / pq, p, q, x, r);                                    // 3. 4. 5.
         error.move(rz / pq);
         const bool enough = is_enough(true);
-        if (r2 > goal && !enough) continue;
+        if (r2 > goal && !enough) {
+            if (is_slow() && P.refresh_locally()) {
+                refreshed = restart = true;
+                error.forget();
+            }
+            continue;
+        }
         const int status = ended(enough);
         if (status >= 0) return finish(status, r2, b2);
     }

@@ -19,6 +19,13 @@ struct Pattern {
     FactorPlan* plan;            // how threads share the solves (factor_plan.h); null: one does all
 };
 
+// Number of values of L.
+static double entries_of(const Pattern& p) {
+    const int last = p.supernodes - 1;
+    const double w = p.super_start[last + 1] - p.super_start[last], h = (double)(p.row_start[last + 1] - p.row_start[last]);
+    return (double)p.value_start[last] + w * h - w * (w - 1) / 2;
+}
+
 template <class T>
 struct Panel {
     const T* values;
