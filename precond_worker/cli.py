@@ -61,6 +61,12 @@ def work(
             metavar="NAME[@EP]", help="Server to work for, may be repeated; '*': every server found [default: sim]"
         ),
     ] = None,
+    tls: Annotated[
+        str | None,
+        typer.Option(
+            metavar="DIR", help="Folder of a certificate, as sim-server certs makes it [default: WARPFACTOR_TLS]"
+        ),
+    ] = None,
     no_shared_memory: Annotated[bool, typer.Option("--no-shared-memory", help="Send arrays as bytes")] = False,
     exit_with_parent: Annotated[
         bool, typer.Option("--exit-with-parent", help="End when the parent process ends")
@@ -84,7 +90,7 @@ def work(
             die_with_parent(parent)
         library = chosen_library(device, precision)
         servers = ["sim"] if server is None else server
-        _serve(connect or [], threads, name or _default_name(), servers, not no_shared_memory, library)
+        _serve(connect or [], threads, name or _default_name(), servers, not no_shared_memory, library, tls)
     except NameTaken as error:
         PROGRAM.bad_input(str(error))
     except DeviceUnusable as error:
@@ -127,7 +133,9 @@ def chosen_library(device: str, precision: str) -> str:
     return "gpu" if precision == "auto" else f"gpu-{precision}"
 
 
-def _serve(connect: list[str], threads: int, name: str, servers: list[str], shared_memory: bool, library: str) -> None:
+def _serve(
+    connect: list[str], threads: int, name: str, servers: list[str], shared_memory: bool, library: str, tls: str | None
+) -> None:  # fmt: skip
     from functools import partial
 
     from precond_worker.factorization.block_columns import compile_ahead
@@ -138,12 +146,19 @@ def _serve(connect: list[str], threads: int, name: str, servers: list[str], shar
     from precond_worker.worker import Worker
     from protocol.channels import check_name
     from protocol.counters import Counters
+    from protocol.network.endpoints import given_endpoints
+    from protocol.network.identity import usual_identity
     from protocol.network.session import Session
+    from protocol.roles import identity_in, own_name
 
     end_in_order()
     try:
+        own = [server.partition("@")[2] for server in servers if "@" in server]
+        identity = usual_identity(tls, ("worker",), [*connect, *own] or given_endpoints())
+        if identity is not None and identity_in(name) != identity.name:
+            name = own_name(identity.name, name[len(identity.name) - 63 :])  # its end tells workers apart
         check_name(name, "--name")
-        where = server_addresses(servers, connect)
+        where = server_addresses(servers, connect, identity is not None)
     except ValueError as error:  # BadEndpoint or Refused
         PROGRAM.bad_input(str(error))
     shown = library_title(library)
@@ -166,7 +181,7 @@ def _serve(connect: list[str], threads: int, name: str, servers: list[str], shar
 
         return Worker(connected, partial(make_factorization, library=library), on_server)
 
-    with MainLoop(where, shared_memory, connection, worker) as serving:
+    with MainLoop(where, shared_memory, connection, worker, identity) as serving:
         serving.run()
 
 

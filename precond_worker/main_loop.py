@@ -16,6 +16,7 @@ from precond_worker.network.server_connection import ServerConnection
 from precond_worker.round_robin import RoundRobin
 from precond_worker.worker import Worker
 from protocol.channels import key, server_in
+from protocol.network.identity import Identity
 from protocol.network.session import Session
 from protocol.refused import Refused
 
@@ -37,6 +38,7 @@ class MainLoop:
         shared_memory: bool,
         connection: MakeConnection,
         worker: MakeWorker,
+        tls: Identity | None = None,
     ):
         self._connection, self._worker = connection, worker
         self._round_robin = RoundRobin(threading.Event())
@@ -44,7 +46,7 @@ class MainLoop:
         self._found: deque[tuple[ServerAddress, Session, str]] = deque(maxlen=4 * MAX_SERVERS)
         self._watching: list[zenoh.Subscriber] = []
         self._closing = ExitStack()
-        self._connector = Connector(addresses, shared_memory, self._round_robin.wake)
+        self._connector = Connector(addresses, shared_memory, self._round_robin.wake, tls)
         self._closing.callback(self._connector.close)
 
     def run(self) -> None:

@@ -79,7 +79,7 @@ def test_commands_reach_the_simulation_and_replies_the_client(stage: tuple[Drive
     driver, session = stage
     push = Interaction(object="beam", kind="push", point=Vector(x=1), force=Vector(y=-5), duration=0.1)
     command = Command(header=Header(protocol=PROTOCOL), client="me", verb="push", interaction=push)
-    handler = ask(session, key("command"), command.SerializeToString())
+    handler = ask(session, key("command", verb="push", client="me"), command.SerializeToString())
     received, reply = driver.until(lambda: driver.link.commands(), "the command")[0]
     assert received == command
     done = Interaction(id=4, object="beam", kind="push", nodes=3)
