@@ -21,8 +21,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from clients.errors import BadInput, ClientError
-from clients.point_option import AT_HELP, PointCommand, point
-from clients.tls_option import TlsGroup
+from clients.options.point import AT_HELP, PointCommand, point
+from clients.options.tls import TlsGroup
 from protocol.channels import DEFAULT_ENDPOINT, SERVER_NAME
 from protocol.network.endpoints import CONNECT
 from protocol.network.web_address import HOST, PORT

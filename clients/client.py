@@ -27,13 +27,13 @@ from clients.queries import Queries, read
 from clients.queries import send as send_query
 from clients.subscriptions import REACTIONS, Poses, States, Steps
 from protocol import messages_pb2 as pb
+from protocol.access.client_name import new_client
+from protocol.access.roles import may
 from protocol.channels import PROTOCOL, ROOT, SERVER_NAME, check_name, key
-from protocol.client_name import new_client
 from protocol.network.endpoints import BadEndpoint, given_endpoints, usual_endpoints
 from protocol.network.identity import ROLES_FILE, usual_identity
 from protocol.network.session import ConnectionFailed, ConnectionRefused, UnknownHost, open_session
 from protocol.refused import Refused
-from protocol.roles import may
 
 M = TypeVar("M", bound=Message)
 Point = Sequence[float]

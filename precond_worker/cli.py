@@ -144,12 +144,12 @@ def _serve(
     from precond_worker.network.server_addresses import ServerAddress, server_addresses
     from precond_worker.network.server_connection import ServerConnection
     from precond_worker.worker import Worker
+    from protocol.access.roles import identity_in, own_name
     from protocol.channels import check_name
     from protocol.counters import Counters
     from protocol.network.endpoints import given_endpoints
     from protocol.network.identity import usual_identity
     from protocol.network.session import Session
-    from protocol.roles import identity_in, own_name
 
     end_in_order()
     try:

@@ -12,9 +12,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from protocol.access.roles import check_identity, check_roles
 from protocol.network.endpoints import CERTIFIED
 from protocol.refused import Refused
-from protocol.roles import check_identity, check_roles
 
 TLS = "WARPFACTOR_TLS"  # folder of workers and clients, where none is given on the command line
 AUTHORITY, CERTIFICATE, KEY, OWN, ROLES_FILE = "ca.pem", "cert.pem", "key.pem", "identity.toml", "roles.toml"

@@ -7,6 +7,7 @@ A certificate of a client or worker cannot be that of a server: its extended key
 import datetime
 import ipaddress
 import os
+import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -124,10 +125,9 @@ def _general_name(host: str) -> x509.GeneralName:
         return x509.IPAddress(ipaddress.ip_address(host.strip("[]")))
     except ValueError:
         pass
-    try:
-        return x509.DNSName(host.encode("idna").decode())
-    except (UnicodeError, ValueError) as error:
-        raise InputError(f"--host {host}: allowed is a name or an address, without port: {error}") from None
+    if not all(re.fullmatch(r"[A-Za-z0-9_-]{1,63}", label) for label in host.split(".")):
+        raise InputError(f"--host {host[:80]!r}: allowed is the name of a host or an address, without port")
+    return x509.DNSName(host)
 
 
 def _builder(

@@ -61,8 +61,8 @@ def certs(
 
 def _split(text: str) -> tuple[str, str]:
     """Returns name and role of NAME:ROLE. Raises Refused."""
+    from protocol.access.roles import check_identity, check_role
     from protocol.network.identity import SERVER
-    from protocol.roles import check_identity, check_role
 
     name, _, role = text.rpartition(":")
     if check_identity(name, f"--client {text}: NAME") == SERVER:

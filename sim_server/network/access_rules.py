@@ -12,9 +12,9 @@ common name has a dot, so that `NAME.$*` are the names of one certificate.
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from protocol.access.roles import ROLES
 from protocol.channels import ROOT, key
 from protocol.network.identity import SERVER
-from protocol.roles import ROLES
 
 PUBLISHED = ("status", "steps", "reactions", "state", "pose")  # channels that clients may subscribe to
 READ = ("status", "scene", "topology", "obstacle")  # channels that clients may query

@@ -7,8 +7,8 @@ from functools import partial
 
 import zenoh
 
+from protocol.access.client_name import check_client
 from protocol.channels import CHANNELS, FORMER_COMMAND, PROTOCOL, ROOT, check_name, commands, key, name_in
-from protocol.client_name import check_client
 from protocol.counters import Counters
 from protocol.messages_pb2 import Command, Echo, Header, Reply
 from protocol.network.session import Session
@@ -62,7 +62,7 @@ class Queryables:
         self._echo_prefix = key("echo", server, worker="*")[:-1]
         self._answers: dict[str, bytes] = {}  # by key
         self._other_version: set[str] = set()  # workers
-        self._queue = CommandQueue(counters)
+        self._queue = CommandQueue(counters, account=rights.account)
         self._done = self._stamped(Reply())
         self._queryables = {}
         self._keys = {channel: key(channel, server) for channel in QUERYABLES} | {FORMER: self._former}
@@ -181,10 +181,10 @@ class Queryables:
         if asked != f"{self._commands}{command.verb}/{command.client}":
             said = f"{command.verb[:80]!r} of {command.client[:80]!r}"
             raise Refused(f"a Command, {said}, came under the key {asked[:200]}; allowed: its own", "key")
-        check_name(command.client, "Command.client")
 
     def _check(self, command: Command) -> None:
         check_header(command, incarnation=self._incarnation if command.header.incarnation else None)
+        check_name(command.client, "Command.client")
         check_strings(command)
         check_strings(command.target, LONGEST_NAME)
         check_numbers(command)

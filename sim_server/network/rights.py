@@ -3,9 +3,9 @@
 
 from collections.abc import Mapping
 
+from protocol.access.roles import ROLES, VERBS, identity_in, may
 from protocol.messages_pb2 import Command, Reply
 from protocol.refused import Refused
-from protocol.roles import ROLES, VERBS, identity_in, may
 
 
 class Rights:
@@ -23,6 +23,10 @@ class Rights:
             return Reply(verbs=VERBS)
         role = self._roles.get(identity_in(client), "")
         return Reply(role=role, verbs=ROLES[role].verbs if role else ())
+
+    def account(self, client: str) -> str:
+        """Returns whose limit of commands a second counts: of a certificate all clients have one together."""
+        return client if self._roles is None else identity_in(client)
 
     def check(self, command: Command) -> None:
         """Raises Refused if the client may not send the command."""

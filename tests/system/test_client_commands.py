@@ -85,7 +85,9 @@ def test_another_cannot_act_in_the_name_of_a_client(running: Stage) -> None:
         def forge(verb: str, secret: bytes) -> str:
             command = pb.Command(header=pb.Header(protocol=PROTOCOL), client=client.id, verb=verb, secret=secret,
                                  interaction=ids)  # fmt: skip
-            replies = session.zenoh.get(key("command"), payload=command.SerializeToString(), timeout=30.0)
+            replies = session.zenoh.get(
+                key("command", verb=verb, client=client.id), payload=command.SerializeToString(), timeout=30.0
+            )
             return next(pb.Reply.FromString(bytes(r.ok.payload)).error for r in replies if r.ok is not None)
 
         for verb in ("move", "release"):
@@ -246,7 +248,9 @@ def test_an_open_port_is_warned_of_and_loopback_is_not(tmp_path: Path) -> None:
     ],
 )
 def test_why_it_cannot_listen(tmp_path: Path, endpoint: str, cause: str) -> None:
-    result = run("sim_server", str(beam(tmp_path, (2, 2, 6), QUIET)), "--steps", "2", "--listen", endpoint)
+    result = run(
+        "sim_server", str(beam(tmp_path, (2, 2, 6), QUIET)), "--steps", "2", "--listen", endpoint, "--insecure"
+    )
     assert result.returncode == 2 and cause in result.stderr and "another sim-server" not in result.stderr
 
 

@@ -9,8 +9,8 @@ import hashlib
 import re
 import secrets
 
+from protocol.access.roles import own_name
 from protocol.refused import Refused
-from protocol.roles import own_name
 
 SECRET_BYTES = 16
 _DIGITS = 24  # hexadecimal: 96 bits of SHA-256
