@@ -24,6 +24,7 @@ from clients.errors import BadInput, ClientError
 from clients.options.point import AT_HELP, PointCommand, point
 from clients.options.tls import TlsGroup
 from protocol.channels import DEFAULT_ENDPOINT, SERVER_NAME
+from protocol.log_pieces import size_of_log
 from protocol.network.endpoints import CONNECT
 from protocol.network.web_address import HOST, PORT
 from protocol.printable import printable
@@ -903,7 +904,7 @@ def _opened(path: Path) -> Iterator:
     from clients.log.reader import Log
     from clients.progress import progress_bar
 
-    size = path.stat().st_size if path.is_file() else 0
+    size = size_of_log(path)
     with progress_bar("reading", size) as progress:
         log = Log(path, progress)
     with log:

@@ -67,6 +67,10 @@ def work(
             metavar="DIR", help="Folder of a certificate, as sim-server certs makes it [default: WARPFACTOR_TLS]"
         ),
     ] = None,
+    metrics: Annotated[
+        str | None,
+        typer.Option(metavar="HOST:PORT", help="Serve metrics for Prometheus; PORT alone: of this machine"),
+    ] = None,
     no_shared_memory: Annotated[bool, typer.Option("--no-shared-memory", help="Send arrays as bytes")] = False,
     exit_with_parent: Annotated[
         bool, typer.Option("--exit-with-parent", help="End when the parent process ends")
@@ -90,7 +94,7 @@ def work(
             die_with_parent(parent)
         library = chosen_library(device, precision)
         servers = ["sim"] if server is None else server
-        _serve(connect or [], threads, name or _default_name(), servers, not no_shared_memory, library, tls)
+        _serve(connect or [], threads, name or _default_name(), servers, not no_shared_memory, library, tls, metrics)
     except NameTaken as error:
         PROGRAM.bad_input(str(error))
     except DeviceUnusable as error:
@@ -134,8 +138,10 @@ def chosen_library(device: str, precision: str) -> str:
 
 
 def _serve(
-    connect: list[str], threads: int, name: str, servers: list[str], shared_memory: bool, library: str, tls: str | None
+    connect: list[str], threads: int, name: str, servers: list[str], shared_memory: bool, library: str,
+    tls: str | None, metrics: str | None,
 ) -> None:  # fmt: skip
+    from contextlib import ExitStack
     from functools import partial
 
     from precond_worker.factorization.block_columns import compile_ahead
@@ -149,7 +155,9 @@ def _serve(
     from protocol.counters import Counters
     from protocol.network.endpoints import given_endpoints
     from protocol.network.identity import usual_identity
+    from protocol.network.metrics_server import MetricsServer, metrics_address
     from protocol.network.session import Session
+    from protocol.refused import Refused
 
     end_in_order()
     try:
@@ -159,15 +167,29 @@ def _serve(
             name = own_name(identity.name, name[len(identity.name) - 63 :])  # its end tells workers apart
         check_name(name, "--name")
         where = server_addresses(servers, connect, identity is not None)
+        metrics_at = None if metrics is None else metrics_address(metrics)
     except ValueError as error:  # BadEndpoint or Refused
         PROGRAM.bad_input(str(error))
     shown = library_title(library)
     compile_ahead()
+    closing = ExitStack()
+    collected = None
+    if metrics_at is not None:
+        from precond_worker.metrics import WorkerMetrics
+
+        collected = WorkerMetrics(name, shown, threads)
+        try:
+            closing.enter_context(MetricsServer(*metrics_at, collected))
+        except Refused as error:
+            PROGRAM.bad_input(str(error))
 
     def connection(session: Session, server: str, wake: Event) -> ServerConnection:
-        return ServerConnection(
+        made = ServerConnection(
             session, server, name, threads, shown, Counters(logging.getLogger("precond_worker")), wake
         )
+        if collected is not None:
+            collected.connections.append(made)
+        return made
 
     def worker(connected: ServerConnection, address: ServerAddress) -> Worker:
         def on_server(found: bool) -> None:
@@ -179,9 +201,10 @@ def _serve(
             else:
                 print(f"precond-worker {name}: {server} is gone, waiting for it", file=sys.stderr, flush=True)
 
-        return Worker(connected, partial(make_factorization, library=library), on_server)
+        observe = (lambda seconds: None) if collected is None else collected.factorization.observe
+        return Worker(connected, partial(make_factorization, library=library), on_server, observe)
 
-    with MainLoop(where, shared_memory, connection, worker, identity) as serving:
+    with closing, MainLoop(where, shared_memory, connection, worker, identity) as serving:
         serving.run()
 
 
@@ -201,7 +224,7 @@ def library_title(library: str) -> str:
         try:
             native()
         except CompileError as error:
-            PROGRAM.bad_input(f"complete factors without scikit-sparse need a C++ compiler: {error}")
+            PROGRAM.bad_input(f"complete factors need a C++ compiler: {error}")
     return name
 
 

@@ -16,7 +16,7 @@ from protocol import messages_pb2 as pb
 from protocol.channels import PROTOCOL, key
 from protocol.network.session import open_session
 from protocol.push_limits import ORPHANED_PUSH
-from tests.system.link_helpers import PATIENCE, free_endpoint
+from tests.system.link_helpers import PATIENCE
 from tests.system.server_process import Stage, beam, fresh, run, until
 from tests.system.test_server import logged
 
@@ -222,21 +222,6 @@ def test_a_client_goes_on_with_a_server_that_was_started_again(stage: Stage, tmp
         client.send("pause", answered=told.put)
         reply = told.get(timeout=PATIENCE)
         assert reply is not None and reply.status.state == "paused"
-
-
-def test_an_open_port_is_warned_of_and_loopback_is_not(tmp_path: Path) -> None:
-    port = free_endpoint().rsplit(":", 1)[1]
-    scene = str(beam(tmp_path, (2, 2, 6), QUIET))
-    said = {}
-    for host in ("0.0.0.0", "127.0.0.1"):
-        result = run("sim_server", scene, "--steps", "2", "--free-run", "--listen", f"tcp/{host}:{port}")
-        assert result.returncode == 0, result.stderr
-        said[host] = [line for line in result.stderr.splitlines() if "--listen" in line]
-    assert said["127.0.0.1"] == []
-    assert said["0.0.0.0"] == [
-        f"sim-server: --listen tcp/0.0.0.0:{port}: anybody who reaches it may stop this server, and push, grab and "
-        "pause; docs/protocol.md (Security) tells how to restrict that"
-    ]
 
 
 @pytest.mark.parametrize(
