@@ -89,6 +89,8 @@ def _worker(name: str, servers: Sequence[str]) -> list[dict[str, Any]]:
         _rule(["put"], ["egress"], keys("matrix", "worker")),
         _rule(["declare_subscriber"], ["ingress"], keys("matrix", "worker")),
         _rule(["declare_subscriber"], ["egress"], keys("factor", "pattern", "worker")),
+        _rule(["declare_subscriber"], ["ingress"], [key("need", "*")]),
+        _rule(["put"], ["egress"], [key("need", "*")]),
         _rule(["query"], ["ingress"], keys("topology", "scene", "echo")),
         _rule(["liveliness_token"], ["ingress", "egress"], keys("alive_worker")),
         _rule(["liveliness_query"], ["ingress"], keys("alive_worker")),

@@ -97,6 +97,7 @@ def test_a_worker_has_the_jobs_under_its_own_names() -> None:
         assert allowed("mill", "put", "ingress", f"sim/{key}")
     assert allowed("mill", "declare_subscriber", "ingress", "sim/matrix/mill.w1/*")
     assert allowed("mill", "put", "egress", "sim/matrix/mill.w1/beam")
+    assert allowed("mill", "declare_subscriber", "ingress", "*/need") and allowed("mill", "put", "egress", "sim/need")
     assert allowed("mill", "query", "ingress", "sim/echo/mill.w1")
     assert allowed("mill", "liveliness_token", "ingress", "sim/alive/worker/mill.w1")
     for name in ("other.w1", "mill", "w1", "*"):
