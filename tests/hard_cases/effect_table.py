@@ -23,6 +23,7 @@ from tests.hard_cases.of_effects import (
     still,
     tells,
 )
+from tests.hard_cases.recipe_table import RECIPES
 from tests.scenes import bar
 from tests.state import put
 
@@ -432,4 +433,4 @@ LOADS = [
     ),
 ]
 
-EFFECT_CASES = [*CONTACT, *CUTS, *MEMORY, *LOADS]
+EFFECT_CASES = [*CONTACT, *CUTS, *MEMORY, *LOADS, *RECIPES]

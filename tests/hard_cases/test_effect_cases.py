@@ -9,9 +9,11 @@ import pytest
 
 from tests.hard_cases.effect_table import EFFECT_CASES
 from tests.hard_cases.of_effects import EffectCase, run_effect_case
+from tests.hard_cases.recipe_table import RECIPES
 
 LONG = ("heavy on soft", "wedge", "fast and small on thin", "prony", "damage", "cable", "growth", "a holder that jumps")
-SHORT = [case for case in EFFECT_CASES if not case.name.startswith(LONG)]
+RECIPE_NAMES = {case.name for case in RECIPES}  # test_recipes.py
+SHORT = [case for case in EFFECT_CASES if not case.name.startswith(LONG) and case.name not in RECIPE_NAMES]
 
 
 @pytest.mark.filterwarnings("ignore::RuntimeWarning")
