@@ -11,7 +11,7 @@ from scipy.sparse import csc_matrix
 from precond_worker.factorization.factorize import Analysis
 from precond_worker.factorization.to_supernodal import Packer
 from precond_worker.symbolic import ordering
-from precond_worker.symbolic.elimination import eliminate, postorder
+from precond_worker.symbolic.elimination import column_structures, columns_of, eliminate, native_columns, postorder
 from precond_worker.symbolic.supernodes import ZEROS_BY_WIDTH, fundamental_supernodes, relaxed_supernodes
 from tests.reference import supernodal
 from tests.worker.block_matrices import bar_edges, dense_matrix, pattern, spd
@@ -39,6 +39,22 @@ def test_columns_and_parents_are_those_of_dense_elimination():
         assert np.array_equal(tree.rows_below(k), below)
         assert tree.count[k] == len(below) + 1
         assert tree.parent[k] == (below[0] if len(below) else -1)
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_native_columns_are_those_of_the_sets(seed):
+    """Of random graphs, some of them in several pieces, in random orders; the rows of a column in any order."""
+    rng = np.random.default_rng(seed)
+    nodes = int(rng.integers(1, 60))
+    graph = pattern(nodes, rng.integers(0, nodes, (int(rng.integers(0, 3 * nodes)), 2)))
+    order = rng.permutation(nodes)
+    found, wanted = native_columns(*graph, order), columns_of(*column_structures(*graph, order))
+    assert found is not None
+    for name in ("parent", "entries", "length"):
+        assert np.array_equal(getattr(found, name), getattr(wanted, name)), name
+    for k in np.flatnonzero(wanted.length > 0):
+        mine, theirs = (c.rows[c.first[k] : c.first[k] + c.length[k]] for c in (found, wanted))
+        assert np.array_equal(np.sort(mine), np.sort(theirs))
 
 
 def test_the_postorder_keeps_subtrees_together_and_the_fill():

@@ -165,7 +165,7 @@ def failures(found: Found) -> list[Row]:
                         wrong.setdefault(row["wrong"], []).append(f"{_place(place)}, seed {row['seed']}")
             case = TABLES[kind][name]
             for text, where in wrong.items():
-                known = getattr(case, "fails", False)
+                known = getattr(case, "fails", False) or getattr(case, "saddle", False)
                 rows.append({"case": f"**{name}**", "where": "; ".join(where), "what": text,
                              "known": "yes" if known else "no", "why": getattr(case, "note", "") or "–"})  # fmt: skip
     return rows

@@ -6,8 +6,9 @@ sparse factors. Here the supernodes of a part are treated as one dense block, so
 phases per group without dependencies inside. Runs on the host, once per pattern.
 """
 
+import ctypes as c
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
@@ -15,6 +16,7 @@ from numpy.typing import NDArray
 
 from protocol.factor import FactorPattern
 from sim_server.arrays import Int64
+from sim_server.backends.compiler import native
 
 Count = TypeVar("Count", int, NDArray[Any])
 NODE = 3  # degrees of freedom of a node
@@ -118,36 +120,31 @@ def _check_closed(tree: Tree) -> None:
 def partition(tree: Tree, thresholds: tuple[int, ...]) -> Partition:
     """Cuts the tree where the degrees of freedom of a subtree exceed one of the ascending thresholds.
 
-    Parts without a boundary (whole trees, or their tops) are in the last group.
+    Parts without a boundary (whole trees, or their tops) are in the last group. Of those, trees of a few nodes (e.g.
+    fixed ones) share a part of one chunk's width.
     """
-    groups = len(thresholds) + 1
-    level = np.searchsorted(np.asarray(thresholds), tree.size, side="left")
-    label = np.arange(len(level)).tolist()
-    parent, levels = tree.parent.tolist(), level.tolist()
-    for s in range(len(parent) - 1, -1, -1):
-        if parent[s] >= 0 and levels[s] == levels[parent[s]]:
-            label[s] = label[parent[s]]
-    root, part = np.unique(label, return_inverse=True)  # a part is named after its root
-    b = (tree.height - tree.width)[root]
-    v = np.bincount(part, tree.width, len(root)).astype(np.int64)
-    group = np.where(b == 0, groups - 1, level[root])
-    joined = _join_small(v, b)
-    part, v = joined[part], np.bincount(joined, v).astype(np.int64)
-    keep = np.unique(joined, return_index=True)[1]
-    root, b, group = root[keep], b[keep], group[keep]
-    order = np.argsort(group, kind="stable")
-    rank = np.empty(len(order), np.int64)
-    rank[order] = np.arange(len(order))
-    return Partition(groups, rank[part], group[order], root[order], v[order], b[order])
+    part, group, root, v, b = (np.empty(len(tree.parent), np.int64) for _ in range(5))
+    count = library().tree_partition(
+        *tree_arguments(tree, thresholds), *(a.ctypes.data for a in (part, group, root, v, b))
+    )
+    return Partition(len(thresholds) + 1, part, *(a[:count].copy() for a in (group, root, v, b)))
 
 
-def _join_small(v: Int64, b: Int64) -> Int64:
-    """Returns a new number for each part; trees of a few nodes (e.g. fixed ones) share a part of one chunk's width."""
-    label, small = np.arange(len(v)), np.flatnonzero((b == 0) & (v <= COLUMNS // 2))
-    room, home = 0, -1
-    for s in small.tolist():
-        if v[s] > room:
-            room, home = COLUMNS, s
-        room -= int(v[s])
-        label[s] = home
-    return np.unique(label, return_inverse=True)[1]
+@cache
+def library() -> c.CDLL:
+    """Compiles and loads tree_cuts.cpp."""
+    p, n, x = c.c_void_p, c.c_int64, c.c_double
+    tree = [n, p, p, p, p, p, n]
+    signatures: dict[str, tuple[Any, list[Any]]] = {
+        "tree_partition": (n, [*tree, *[p] * 5]), "tree_estimate": (x, [*tree, n, n, n]),
+        "tree_predict": (x, [*tree, n, n, n]), "tree_phase": (n, [n, n, p, p, p, n, n, p, p, p]),
+        "balance_tiles": (n, [n, p, p, p, n, p]),
+    }  # fmt: skip
+    return native("backends/gpu/inverse/tree_cuts.cpp", signatures)
+
+
+def tree_arguments(tree: Tree, thresholds: tuple[int, ...]) -> tuple[Any, ...]:
+    """Returns the arguments of a function of the library that describe a tree and its cuts."""
+    cuts = (c.c_int64 * max(len(thresholds), 1))(*thresholds)
+    arrays = (a.ctypes.data for a in (tree.parent, tree.width, tree.height, tree.size))
+    return len(tree.parent), *arrays, cuts, len(thresholds)

@@ -197,7 +197,7 @@ def _depth(parts: Parts, slot_start: Int32) -> Int64:
 def _partition_work(cut: Partition, parts: Parts, blocks: int, planes: int, depth: Int64) -> dict[str, Any]:
     """Returns segments and tiles of all phases, and the first chunk of each block."""
     segments, tiles, keys, areas = [], [], [], [0]
-    for phase, (which, work) in enumerate(phase_work(cut, blocks, planes)):
+    for phase, (which, work) in enumerate(phase_work(cut, planes)):
         pieces = balance(work, blocks)
         found = _Phase(phase, cut.groups, parts, which, pieces, depth)
         segments.append(found.segments())

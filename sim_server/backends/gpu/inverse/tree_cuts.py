@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
 """Choice of the thresholds that cut the elimination tree, by the least predicted time of one application.
 
-Few groups have few phases, each with a latency, and many bytes; many groups the reverse. The constants were measured on
-an H200. The ratio of latency to bandwidth decides, and it is similar on other large GPUs.
+Few groups have few phases, each with a latency, and many bytes; many groups the reverse. Times are predicted by native
+code (tree_cuts.cpp, which has the constants): hundreds of thresholds are compared for each topology.
 """
 
 from collections.abc import Iterator
@@ -10,87 +10,28 @@ from collections.abc import Iterator
 import numpy as np
 
 from sim_server.arrays import Int64
-from sim_server.backends.gpu.inverse.load_balance import PhaseWork, balance
-from sim_server.backends.gpu.inverse.partition import COLUMNS, ROWS, Partition, Tree, padded, partition
+from sim_server.backends.gpu.inverse.load_balance import PhaseWork
+from sim_server.backends.gpu.inverse.partition import Partition, Tree, library, tree_arguments
 
-LATENCY, LATENCY_ALONE = 3000.0, 400.0  # of a phase [ns]: of several blocks, of one block
-MEMORY, CACHE, SHARED = 4400 / 132, 7000 / 132, 25000 / 132  # bandwidths of one block [bytes/ns]
-CACHED = 25e6  # bytes that stay in the near half of the second-level cache
 SHARED_MEMORY = 227_000  # bytes of a thread block that has a multiprocessor for itself
-KEPT, X_AREA = 0.83, 0.7  # share of a block's shared memory: for matrices and vectors; for vectors at most
-LOAD, LOAD_ENTRY = 250.0, 0.4  # time of loading the vector of a part [ns]: constant, per entry
-FLOPS, USES = 10e3, 3000  # of building the inverse: float32 operations per ns; applications that share its time
 MAX_GROUPS = 9
 
 
-def phase_work(cut: Partition, blocks: int, planes: int) -> Iterator[tuple[Int64, PhaseWork]]:
+def phase_work(cut: Partition, planes: int) -> Iterator[tuple[Int64, PhaseWork]]:
     """Yields, phase by phase, the parts and their work."""
-    inside, outside = padded(cut.v, COLUMNS), padded(cut.b, COLUMNS)
-    rate = _rate(cut, planes)
+    parts, arrays = len(cut.v), (cut.group, cut.v, cut.b)
     for phase in range(2 * cut.groups - 1):
-        group = min(phase, 2 * cut.groups - 2 - phase)
-        which = np.flatnonzero(cut.group == group)
-        forward, backward = phase < cut.groups - 1, phase >= cut.groups
-        rows = padded(cut.b[which] if forward else cut.v[which], ROWS) // ROWS
-        columns = inside[which] + outside[which] * backward
-        tile = columns * (2.0 * ROWS * planes) / rate
-        yield which, PhaseWork(rows, tile, LOAD + LOAD_ENTRY * columns)
+        which = np.flatnonzero(cut.group == min(phase, 2 * cut.groups - 2 - phase))
+        work = PhaseWork(np.empty(len(which), np.int64), np.empty(len(which)), np.empty(len(which)))
+        library().tree_phase(
+            cut.groups, parts, *(a.ctypes.data for a in arrays), phase, planes, *(a.ctypes.data for a in work)
+        )
+        yield which, work
 
 
-def _rate(cut: Partition, planes: int) -> float:
-    return CACHE if _bytes(cut, planes) < CACHED else MEMORY
-
-
-def _bytes(cut: Partition, planes: int) -> float:
-    v, b = padded(cut.v, COLUMNS).astype(float), padded(cut.b, COLUMNS).astype(float)
-    return float((v * v + 2 * v * b).sum()) * 2 * planes
-
-
-def estimate(cut: Partition, blocks: int, planes: int, shared: int) -> float:
-    """Estimates the time of one application [ns] with perfect balance, plus a share of the time of building."""
-    rate, kept, time = _rate(cut, planes), KEPT * shared, 0.0
-    for which, work in phase_work(cut, blocks, planes):
-        if len(which) == 0:
-            continue
-        stream = work.tiles * work.tile
-        busiest = max(float(stream.sum()) / blocks, float(work.tile.max()))
-        shares = np.maximum(1, np.minimum(work.tiles, stream / busiest))  # blocks of each part
-        load = float((work.load * shares).sum()) / min(blocks, float(np.ceil(shares).sum()))
-        bytes_kept = min(kept, busiest * rate)
-        kept -= bytes_kept
-        time += bytes_kept / SHARED + (busiest - bytes_kept / rate) + load + _latency(blocks)
-    return time + _build_time(cut)
-
-
-def predict(cut: Partition, blocks: int, planes: int, shared: int) -> float:
-    """Predicts the same time with the actual partition of the work."""
-    rate, kept, time = _rate(cut, planes), np.full(blocks, KEPT * shared), 0.0
-    for _, work in phase_work(cut, blocks, planes):
-        pieces = balance(work, blocks)
-        stream = np.bincount(pieces.block, pieces.tiles * work.tile[pieces.matrix], blocks)
-        load = np.bincount(pieces.block, work.load[pieces.matrix], blocks)
-        bytes_kept = np.minimum(kept, stream * rate)
-        kept -= bytes_kept
-        time += float((bytes_kept / SHARED + stream - bytes_kept / rate + load).max()) + _latency(blocks)
-    return time + _build_time(cut)
-
-
-def _latency(blocks: int) -> float:
-    return LATENCY_ALONE if blocks == 1 else LATENCY
-
-
-def _build_time(cut: Partition) -> float:
-    """Returns the time of building the inverse [ns], divided by the applications that share it."""
-    v, b = cut.v.astype(float), cut.b.astype(float)
-    return float((2 / 3 * v**3 + v * v * b).sum()) / FLOPS / USES
-
-
-def largest_area(cut: Partition, blocks: int) -> float:
-    """Returns about the largest number of entries that one block loads in a phase."""
-    return max(
-        float(((padded(cut.v, COLUMNS) + padded(cut.b, COLUMNS))[cut.group == g]).sum()) / blocks
-        for g in range(cut.groups)
-    )
+def predict(tree: Tree, thresholds: tuple[int, ...], blocks: int, planes: int, shared: int) -> float:
+    """Predicts the time of one application [ns], plus a share of the time of building, with the work balanced."""
+    return float(library().tree_predict(*tree_arguments(tree, thresholds), blocks, planes, shared))
 
 
 def candidates(tree: Tree, groups: int) -> Iterator[tuple[int, ...]]:
@@ -126,7 +67,7 @@ def choose_thresholds(
         if not groups and best[0] > 1.5 * min(found)[0]:
             break  # more phases do not help any more
     near = [_improved(tree, pair, blocks, planes, shared) for pair in found if pair[0] < 1.3 * min(found)[0]]
-    return min((predict(partition(tree, t), blocks, planes, shared), t) for _, t in near)[1]
+    return min((predict(tree, t, blocks, planes, shared), t) for _, t in near)[1]
 
 
 def _improved(
@@ -143,8 +84,5 @@ def _improved(
 
 
 def _estimate(tree: Tree, thresholds: tuple[int, ...], blocks: int, planes: int, shared: int) -> float:
-    cut = partition(tree, thresholds)
-    if cut.groups > 1 and len(np.unique(cut.group)) < cut.groups:
-        return np.inf
-    time = estimate(cut, blocks, planes, shared)
-    return time * 10 if 4 * largest_area(cut, blocks) > X_AREA * shared else time
+    """Estimates the same time with perfect balance; infinite where the tree has fewer groups."""
+    return float(library().tree_estimate(*tree_arguments(tree, thresholds), blocks, planes, shared))
