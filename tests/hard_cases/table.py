@@ -14,8 +14,8 @@ NO_FACTOR_YET = "The first ten steps have no factor yet, and block Jacobi alone 
 
 SADDLE = (
     "Between two ways to turn back lies an equilibrium, at which rounding decides: moved by less than 1e-9 of its "
-    "length it goes through states with inverted elements and may come to rest in one (Poisson's ratio 0.45, see random "
-    "starts); moved by a millimetre it comes back. Only with the exact symmetry of seed 0 on a CPU it is back at once."
+    "length it goes through states with inverted elements and may come to rest in one (as random starts at 0.45, "
+    "below); moved by a millimetre it comes back. Only with the exact symmetry of seed 0 on a CPU it is back at once."
 )
 
 MATERIAL = [
