@@ -23,6 +23,7 @@ import typer
 from clients.errors import BadInput, ClientError
 from clients.point_option import AT_HELP, PointCommand, point
 from protocol.channels import DEFAULT_ENDPOINT, SERVER_NAME
+from protocol.log_pieces import size_of_log
 from protocol.network.endpoints import CONNECT
 from protocol.network.web_address import HOST, PORT
 from protocol.printable import printable
@@ -900,7 +901,7 @@ def _opened(path: Path) -> Iterator:
     from clients.log.reader import Log
     from clients.progress import progress_bar
 
-    size = path.stat().st_size if path.is_file() else 0
+    size = size_of_log(path)
     with progress_bar("reading", size) as progress:
         log = Log(path, progress)
     with log:

@@ -60,7 +60,7 @@ def _summary(status: pb.Status) -> Text:
         f"as bytes {status.bulk_copied}; clients {len(status.clients)}",
     ]
     if status.recording_failure:
-        lines.append(f"no log any more: {status.recording_failure}")
+        lines.append(f"the log is not whole: {status.recording_failure}")
     return Text("\n".join(lines))
 
 

@@ -17,6 +17,7 @@ import time
 import webbrowser
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -26,8 +27,11 @@ from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeEl
 from rich.table import Table
 
 from clients.client import Client
+from clients.demo.run import take_hand
 from clients.errors import ClientError
+from clients.log.frames import Frame
 from clients.log.reader import Log
+from clients.subscriptions import States
 
 ROOT = Path(__file__).resolve().parent.parent
 OUT = ROOT / "out" / "demo"
@@ -103,14 +107,18 @@ def play(server: "subprocess.Popen[bytes]") -> None:
                     taken = client.push("creature", at="top", force=(0, 0, -12), radius=0.1, duration=0.2)
                     progress.console.print(f"step {frame.step}: a client pushes {taken.nodes} nodes of the head")
                 if GRAB_AT <= frame.step < RELEASE_AT and grab is None:
-                    start = frame.x[hand]
-                    grab = client.grab("creature", at=tuple(start), radius=0.035, stiffness=400, max_force=100)
+                    grab, start = take_hand(client, hand, partial(newest, states, frame))
                     progress.console.print(f"step {frame.step}: a client takes its hand and drags it about")
                 if grab is not None and frame.step < RELEASE_AT:
                     grab.move(start + way((frame.step - GRAB_AT) / (RELEASE_AT - GRAB_AT)))
                 elif grab is not None and not grab.released:
                     grab.release()
         progress.update(task, completed=STEPS)
+
+
+def newest(states: States, known: Frame) -> NDArray[np.float64]:
+    """Returns the positions of the newest frame that has come, else of one that is known [m]."""
+    return [known, *states.newest()][-1].x
 
 
 def way(part: float) -> NDArray[np.float64]:

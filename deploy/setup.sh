@@ -72,17 +72,18 @@ have_chromium() { have chromium || have chromium-browser || have google-chrome; 
 is_debian() { grep -qx 'ID=debian' /etc/os-release 2>/dev/null; }  # Ubuntu has chromium as a snap only
 have_software_vulkan() { compgen -G '/usr/share/vulkan/icd.d/lvp_icd*.json' >/dev/null; }
 
-# missing_packages [mesa-vulkan-drivers] [chromium]: names of the Debian packages for what is not there.
+# missing_packages [mesa-vulkan-drivers] [chromium] [cholmod]: names of the Debian packages for what is not there.
 missing_packages() {
     if [ -z "${PYTHON:-}" ]; then  # another interpreter brings its own
         have_python || echo python3
         have_venv || echo python3-venv
-        have_python_headers || echo python3-dev
+        [[ " $* " != *" cholmod "* ]] || have_python_headers || echo python3-dev
     fi
     have_compiler || echo g++
-    # CHOLMOD, and OpenBLAS for it: on the reference BLAS a factorization takes 4 to 10 times as long.
-    have_suitesparse || echo libsuitesparse-dev
-    have_openblas || echo libopenblas-dev
+    if [[ " $* " == *" cholmod "* ]]; then  # tests and benches compare with it
+        have_suitesparse || echo libsuitesparse-dev
+        have_openblas || echo libopenblas-dev  # on the reference BLAS a factorization takes 4 to 10 times as long
+    fi
     case " $* " in
         # draws the demonstration's picture without a GPU or a screen
         *" mesa-vulkan-drivers "*) have_software_vulkan || echo mesa-vulkan-drivers ;;
@@ -149,7 +150,7 @@ check_blas() {
             */blas/* | */lapack/*) ;;
             *) continue ;;
         esac
-        say "$name is the slow reference library here; factors take a quarter of the time with OpenBLAS," \
+        say "$name is the slow reference library here; CHOLMOD takes a quarter of the time with OpenBLAS," \
             "which this chooses for the whole machine: sudo update-alternatives --auto $name"
     done
 }
@@ -215,13 +216,12 @@ install_python_packages() {
             tail -n 20 "$venv/setup.log" >&2
             stop 1 "pip failed; $venv/setup.log has all of it"
         fi
-        install_cholmod
+        [[ ",$extras," != *",test,"* ]] || install_cholmod
         printf '%s\n' "$now" >"$stamp"
     fi
-    have_sksparse || say "without scikit-sparse: factors come from native code of our own"
 }
 
-# set_up EXTRAS [mesa-vulkan-drivers] [chromium]
+# set_up EXTRAS [mesa-vulkan-drivers] [chromium] [cholmod]
 set_up() {
     local extras=$1
     shift
@@ -231,7 +231,7 @@ set_up() {
     fi
     install_system_packages "$@"
     require_essentials
-    check_blas
+    [[ " $* " != *" cholmod "* ]] || check_blas
     install_python_packages "$extras"
     if have flock; then
         exec 9<&-

@@ -61,6 +61,10 @@ def work(
             metavar="NAME[@EP]", help="Server to work for, may be repeated; '*': every server found [default: sim]"
         ),
     ] = None,
+    metrics: Annotated[
+        str | None,
+        typer.Option(metavar="HOST:PORT", help="Serve metrics for Prometheus; PORT alone: of this machine"),
+    ] = None,
     no_shared_memory: Annotated[bool, typer.Option("--no-shared-memory", help="Send arrays as bytes")] = False,
     exit_with_parent: Annotated[
         bool, typer.Option("--exit-with-parent", help="End when the parent process ends")
@@ -84,7 +88,7 @@ def work(
             die_with_parent(parent)
         library = chosen_library(device, precision)
         servers = ["sim"] if server is None else server
-        _serve(connect or [], threads, name or _default_name(), servers, not no_shared_memory, library)
+        _serve(connect or [], threads, name or _default_name(), servers, not no_shared_memory, library, metrics)
     except NameTaken as error:
         PROGRAM.bad_input(str(error))
     except DeviceUnusable as error:
@@ -127,7 +131,11 @@ def chosen_library(device: str, precision: str) -> str:
     return "gpu" if precision == "auto" else f"gpu-{precision}"
 
 
-def _serve(connect: list[str], threads: int, name: str, servers: list[str], shared_memory: bool, library: str) -> None:
+def _serve(
+    connect: list[str], threads: int, name: str, servers: list[str], shared_memory: bool, library: str,
+    metrics: str | None,
+) -> None:  # fmt: skip
+    from contextlib import ExitStack
     from functools import partial
 
     from precond_worker.factorization.block_columns import compile_ahead
@@ -138,21 +146,37 @@ def _serve(connect: list[str], threads: int, name: str, servers: list[str], shar
     from precond_worker.worker import Worker
     from protocol.channels import check_name
     from protocol.counters import Counters
+    from protocol.network.metrics_server import MetricsServer, metrics_address
     from protocol.network.session import Session
+    from protocol.refused import Refused
 
     end_in_order()
     try:
         check_name(name, "--name")
         where = server_addresses(servers, connect)
+        metrics_at = None if metrics is None else metrics_address(metrics)
     except ValueError as error:  # BadEndpoint or Refused
         PROGRAM.bad_input(str(error))
     shown = library_title(library)
     compile_ahead()
+    closing = ExitStack()
+    collected = None
+    if metrics_at is not None:
+        from precond_worker.metrics import WorkerMetrics
+
+        collected = WorkerMetrics(name, shown, threads)
+        try:
+            closing.enter_context(MetricsServer(*metrics_at, collected))
+        except Refused as error:
+            PROGRAM.bad_input(str(error))
 
     def connection(session: Session, server: str, wake: Event) -> ServerConnection:
-        return ServerConnection(
+        made = ServerConnection(
             session, server, name, threads, shown, Counters(logging.getLogger("precond_worker")), wake
         )
+        if collected is not None:
+            collected.connections.append(made)
+        return made
 
     def worker(connected: ServerConnection, address: ServerAddress) -> Worker:
         def on_server(found: bool) -> None:
@@ -164,9 +188,10 @@ def _serve(connect: list[str], threads: int, name: str, servers: list[str], shar
             else:
                 print(f"precond-worker {name}: {server} is gone, waiting for it", file=sys.stderr, flush=True)
 
-        return Worker(connected, partial(make_factorization, library=library), on_server)
+        observe = (lambda seconds: None) if collected is None else collected.factorization.observe
+        return Worker(connected, partial(make_factorization, library=library), on_server, observe)
 
-    with MainLoop(where, shared_memory, connection, worker) as serving:
+    with closing, MainLoop(where, shared_memory, connection, worker) as serving:
         serving.run()
 
 
@@ -186,7 +211,7 @@ def library_title(library: str) -> str:
         try:
             native()
         except CompileError as error:
-            PROGRAM.bad_input(f"complete factors without scikit-sparse need a C++ compiler: {error}")
+            PROGRAM.bad_input(f"complete factors need a C++ compiler: {error}")
     return name
 
 

@@ -43,12 +43,14 @@ class Worker:
     """Does the jobs of one server one by one: the object that waits longest first, of each the newest matrix."""
 
     def __init__(
-        self, connection: ServerConnection, analyse: Analyse, on_server: Callable[[bool], None] = lambda found: None
-    ):
+        self, connection: ServerConnection, analyse: Analyse, on_server: Callable[[bool], None] = lambda found: None,
+        on_factorization: Callable[[float], None] = lambda seconds: None,
+    ):  # fmt: skip
         self._connection = connection
         self._counters = connection.counters
         self._analyse = analyse
         self._on_server = on_server
+        self._on_factorization = on_factorization
         self._analyses: dict[tuple[str, str], CachedAnalysis] = {}  # by object and name of the method
         self._assemblers = Assemblers(connection)
         self._pending: dict[str, Job] = {}
@@ -167,6 +169,7 @@ class Worker:
         # In memory of this process, so that the checksum is of what was computed, whatever happens to the slot.
         factor = np.ascontiguousarray(analysis.factorize(values, np.dtype(message.factor_dtype)))
         seconds = time.perf_counter() - begin
+        self._on_factorization(seconds)
         if not complete:
             self._send_pattern(job, analysis.pattern)
         self._answer(job, analysis.pattern, factor, seconds, remedy=analysis.remedy)

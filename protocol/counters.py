@@ -42,6 +42,11 @@ class Counters:
         if first:
             self._logger.warning(text)
 
+    def copy(self) -> tuple[dict[str, int], dict[str, int]]:
+        """Returns (counts by name, refusals by kind) as they are now."""
+        with self._lock:
+            return dict(self._counts), dict(self.refusals)
+
     @property
     def refused(self) -> int:
         """Messages refused, of all kinds."""

@@ -7,6 +7,7 @@ server was killed has no index, and everything up to the last complete chunk can
 
 from __future__ import annotations
 
+import contextlib
 import os
 import struct
 import zlib
@@ -109,6 +110,20 @@ class ChunkFile:
         version = self.metadata.get("warpfactor", {}).get("protocol", "unknown")
         if version != str(PROTOCOL):
             raise BadLog(f"{self.path}: a log of protocol version {version}; this program reads version {PROTOCOL}")
+
+    def origin(self) -> dict[str, str]:
+        """Returns what the writer says of the file at its start; empty if it is not there."""
+        if "warpfactor" not in self.metadata:
+            problems, self.problems = self.problems, []
+            for _, opcode, body in self._records():
+                if opcode == Opcode.METADATA:
+                    with contextlib.suppress(*BROKEN):
+                        record = Metadata.read(body)
+                        self.metadata.setdefault(record.name, record.metadata)
+                if opcode != Opcode.HEADER:
+                    break
+            self.problems, self.complete = problems, False
+        return self.metadata.get("warpfactor", {})
 
     def notes(self) -> list[str]:
         """Returns one sentence for each gap, after `scan`."""

@@ -1,16 +1,20 @@
 # SPDX-License-Identifier: MIT
-"""Messages of a log by kind and object, above the chunks of its file (log_chunks.py)."""
+"""Messages of a log by kind and object, above the chunks of its files (log_chunks.py, log_pieces.py)."""
 
 from __future__ import annotations
 
+import contextlib
+from bisect import bisect_right
 from collections import OrderedDict
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import NamedTuple, Self
 
 from mcap.records import Channel, McapRecord, Message
 
-from protocol.log_chunks import ChunkFile
+from protocol.log_chunks import BadLog, ChunkFile
+from protocol.log_pieces import later_pieces
 
 CHUNKS = 8  # kept unpacked, about 1 MiB each
 
@@ -18,7 +22,7 @@ CHUNKS = 8  # kept unpacked, about 1 MiB each
 class LogMessage(NamedTuple):
     """A message of the topic /KIND or /KIND/OBJECT, not decoded.
 
-    offset: of its chunk [bytes]. number: of the message among the records of the chunk.
+    offset: of its chunk, in all pieces one after another [bytes]. number: of the message among the chunk's records.
     """
 
     topic: str
@@ -32,33 +36,78 @@ class LogMessage(NamedTuple):
 
 @dataclass
 class LogFile(ChunkFile):
-    """The messages of one log; a context manager."""
+    """The messages of one log, of all its pieces; a context manager. Without the first piece it begins at the next."""
 
     _chunks: OrderedDict[int, list[McapRecord]] = field(default_factory=OrderedDict)  # by offset, the last used last
+    later: list[ChunkFile] = field(default_factory=list)
+
+    @classmethod
+    def open(cls, path: Path) -> Self:
+        """Opens a log. Raises BadLog if there is none, or it is no MCAP file."""
+        pieces = [piece for _, piece in later_pieces(path)]
+        log = super().open(pieces.pop(0) if pieces and not path.exists() else path)
+        run = log.origin().get("run")
+        for piece in pieces if run else ():
+            with contextlib.suppress(BadLog):  # one that was begun when the disk was full has no beginning
+                file = ChunkFile.open(piece)
+                log.later.append(file) if file.origin().get("run") == run else file.close()
+        return log
+
+    def _pieces(self) -> list[ChunkFile]:
+        return [self, *self.later]
 
     def messages(self, progress: Callable[[int], None] = lambda _: None) -> Iterator[LogMessage]:
         """Yields the messages in file order; `progress` gets the offset reached.
 
         Raises BadLog before the first message unless the file is a log of this protocol version.
         """
-        topics: dict[int, tuple[str, str, str]] = {}
-        for offset, records in self.scan(progress):
-            self.check_origin()
-            for number, record in enumerate(records):
-                if isinstance(record, Channel):
-                    _, kind, name = [*record.topic.split("/", 2), "", ""][:3]
-                    topics[record.id] = record.topic, kind, name
-                elif isinstance(record, Message):
-                    topic = topics.get(record.channel_id, ("", "", ""))
-                    yield LogMessage(*topic, record.log_time, record.data, offset, number)
-        self.check_origin()
+        base, piece_before = 0, 0
+        for piece in self._pieces():
+            topics: dict[int, tuple[str, str, str]] = {}
+            place, repeated = _place(piece)
+            skip = repeated if place == piece_before + 1 and piece is not self else 0
+            for offset, records in piece.scan(lambda reached, base=base: progress(base + reached)):  # type: ignore[misc]
+                piece.check_origin()
+                for number, record in enumerate(records):
+                    if isinstance(record, Channel):
+                        _, kind, name = [*record.topic.split("/", 2), "", ""][:3]
+                        topics[record.id] = record.topic, kind, name
+                    elif isinstance(record, Message):
+                        if skip > 0:
+                            skip -= 1
+                            continue
+                        topic = topics.get(record.channel_id, ("", "", ""))
+                        yield LogMessage(*topic, record.log_time, record.data, base + offset, number)
+            piece.check_origin()
+            base, piece_before = base + piece.size, place
+
+    @property
+    def whole(self) -> bool:
+        """True if all pieces were closed by their writer and every block of them could be read; after `messages`."""
+        return all(piece.complete and not piece.problems for piece in self._pieces())
+
+    @property
+    def begins_late(self) -> bool:
+        """True if the first piece that is there is not the first that was written."""
+        return _place(self)[0] > 1
+
+    def notes(self) -> list[str]:
+        """Returns one sentence for each gap, after `messages`."""
+        return [note for piece in self._pieces() for note in ChunkFile.notes(piece)]
+
+    def close(self) -> None:
+        for piece in self._pieces():
+            piece.stream.close()
 
     def data(self, offset: int, number: int) -> bytes:
         """Returns the data of a message that `messages` has yielded."""
         if offset not in self._chunks:
             while len(self._chunks) >= CHUNKS:
                 self._chunks.popitem(last=False)
-            self._chunks[offset] = self.chunk(offset)
+            pieces = self._pieces()
+            begins = [sum(piece.size for piece in pieces[:k]) for k in range(len(pieces))]
+            k = bisect_right(begins, offset) - 1
+            self._chunks[offset] = pieces[k].chunk(offset - begins[k])
         self._chunks.move_to_end(offset)
         record = self._chunks[offset][number]
         assert isinstance(record, Message)
@@ -69,3 +118,10 @@ class LogFile(ChunkFile):
 
     def __exit__(self, *_: object) -> None:
         self.close()
+
+
+def _place(piece: ChunkFile) -> tuple[int, int]:
+    """Returns (number of a piece, messages at its start that repeat earlier ones); a file without them is the first."""
+    origin = piece.origin()
+    number, repeated = origin.get("piece", ""), origin.get("repeated", "")
+    return int(number) if number.isdecimal() else 1, int(repeated) if repeated.isdecimal() else 0

@@ -94,6 +94,13 @@ def serve(
         bool, typer.Option("--realtime/--free-run", help="Keep pace with the clock, or as fast as it goes")
     ] = True,
     record: Annotated[Path | None, typer.Option(metavar="FILE.mcap", help="Write a log (replaces the file)")] = None,
+    record_rotate: Annotated[
+        list[str] | None,
+        typer.Option(metavar="SIZE|TIME", help="Go on in a new file after so much, as 500MB or 1h; may be repeated"),
+    ] = None,
+    record_keep: Annotated[
+        str | None, typer.Option(metavar="SIZE", help="Remove the oldest files of the log beyond so much, as 20GB")
+    ] = None,
     resume: Annotated[Path | None, typer.Option(metavar="FILE", help="Go on where sim-client save saved this")] = None,
     connect: Annotated[list[str] | None, typer.Option(metavar="EP", help="Link with another server or router")] = None,
     listen: Annotated[
@@ -112,6 +119,10 @@ def serve(
         typer.Option(
             metavar="[HOST:PORT]", help="Serve a page where bodies are dragged (sim-client web), at 127.0.0.1:8080"
         ),
+    ] = None,
+    metrics: Annotated[
+        str | None,
+        typer.Option(metavar="HOST:PORT", help="Serve metrics for Prometheus; PORT alone: of this machine"),
     ] = None,
     name: Annotated[str, typer.Option(metavar="NAME", help="Name of this server in all keys")] = "sim",
     no_shared_memory: Annotated[bool, typer.Option("--no-shared-memory", help="Send arrays as bytes")] = False,
@@ -150,7 +161,7 @@ def serve(
     try:
         options = Options(
             scene, set_ or [], choose_device(device, say), name, listen, connect, not no_shared_memory, record, steps,
-            realtime, workers, worker_device, web, quiet, resume,
+            realtime, workers, worker_device, web, quiet, resume, metrics, record_rotate or [], record_keep,
         )  # fmt: skip
         with ExitStack() as closing:
             with nullcontext() if quiet else compile_notices(say):
@@ -173,7 +184,7 @@ def serve(
         print(f"sim-server: {error}", file=sys.stderr)
         code = 1
     if service is not None and service.recorder is not None and service.recorder.failure:
-        print(f"sim-server: exit code 1: the log {record} ends before the run does", file=sys.stderr)
+        print(f"sim-server: exit code 1: the log {record} is not whole", file=sys.stderr)
         code = 1
     raise typer.Exit(code)
 
@@ -234,6 +245,9 @@ class Options:
     web: str | None
     quiet: bool
     resume: Path | None
+    metrics: str | None
+    record_rotate: list[str]
+    record_keep: str | None
 
 
 def _set_up(closing: ExitStack, o: Options) -> "tuple[Service, Supervisor | None]":
@@ -241,12 +255,14 @@ def _set_up(closing: ExitStack, o: Options) -> "tuple[Service, Supervisor | None
     from protocol.channels import DEFAULT_ENDPOINT
     from protocol.network.endpoints import BadEndpoint, on_this_machine
     from protocol.network.exposure import unrestricted
+    from protocol.network.metrics_server import metrics_address
     from protocol.network.session import AddressInUse, ConnectionFailed
     from protocol.refused import Refused
     from sim_server.backends.compiler import CompileError
     from sim_server.checkpoint.file import read
     from sim_server.network.link import ServerLink
     from sim_server.recording.recorder import Recorder
+    from sim_server.recording.rotation import Rotation
     from sim_server.service.service import Service
     from sim_server.service.supervisor import Supervisor
     from sim_server.service.web_page import WebPage
@@ -255,6 +271,10 @@ def _set_up(closing: ExitStack, o: Options) -> "tuple[Service, Supervisor | None
     end_in_order()
     try:
         page = _page_address(o.web)
+        rotation = Rotation.of_options(o.record_rotate, o.record_keep)
+        if (o.record_rotate or o.record_keep) and o.record is None:
+            raise InputError("--record-rotate and --record-keep go with --record")
+        metrics = None if o.metrics is None else metrics_address(o.metrics)
         checkpoint = None if o.resume is None else read(o.resume)
         simulation = Simulation.load(o.scene, o.overrides, o.device)
         link = closing.enter_context(ServerLink(o.name, o.listen, o.connect, shared_memory=o.shared_memory))
@@ -262,11 +282,15 @@ def _set_up(closing: ExitStack, o: Options) -> "tuple[Service, Supervisor | None
         if o.record is not None:
             _check_log_path(o.record)
             compression = simulation.scene.record.compression
-            recorder = closing.enter_context(Recorder(o.record, compression, overwrite=True, report=logging.error))
+            recorder = closing.enter_context(
+                Recorder(o.record, compression, overwrite=True, report=logging.error, rotation=rotation)
+            )
         try:
             service = Service(simulation, link, recorder, o.steps, o.realtime, checkpoint)
         except InputError as error:
             raise InputError(f"--resume {o.resume}: {error}" if o.resume else str(error)) from None
+        if metrics is not None:
+            _serve_metrics(closing, service, *metrics)
     except AddressInUse as error:
         PROGRAM.bad_input(f"{error}; is another sim-server there? --listen tcp/127.0.0.1:7448 takes another port")
     except (InputError, BadEndpoint, ConnectionFailed, Refused, CompileError) as error:
@@ -288,6 +312,18 @@ def _set_up(closing: ExitStack, o: Options) -> "tuple[Service, Supervisor | None
         closing.callback(web.close)
         service.check_page = web.check
     return service, supervisor
+
+
+def _serve_metrics(closing: ExitStack, service: "Service", host: str, port: int) -> None:
+    """Serves metrics until `closing` closes. Raises Refused if they cannot be served there."""
+    from protocol.network.metrics_server import MetricsServer
+    from sim_server.service.metrics import ServerMetrics
+
+    names = [body.name for body in service.simulation.world.bodies]
+    found = ServerMetrics(names, service.link, service.recorder)
+    closing.enter_context(MetricsServer(host, port, found, service.health.why_not))
+    service.telemetry.metrics = found
+    service.telemetry.publish_status("running")
 
 
 def _page_address(web: str | None) -> tuple[str, int] | None:

@@ -14,6 +14,8 @@ import numpy as np
 import pytest
 from rich.console import Console
 
+from clients.demo.run import take_hand
+from clients.errors import BadInput
 from tests.ports import free_port
 
 DEMO = Path(__file__).parents[1] / "deploy" / "demo.py"
@@ -124,3 +126,22 @@ def test_the_page_opens_on_the_creature_and_ends_with_its_server(
     assert server[:2] == ("sim_server", "gallery/creature") and not {"--steps", "--record"} & set(server)
     assert page[:2] == ("clients", "web") and page[page.index("--connect") + 1] == server[server.index("--listen") + 1]
     assert address == f"http://127.0.0.1:{page[page.index('--port') + 1]}" and address in capsys.readouterr().out
+
+
+def test_a_hand_that_moves_fast_is_taken_all_the_same():
+    """Where it was is empty: its place is asked for again, and at last the nearest node is taken."""
+    asked = []
+
+    class Client:
+        def grab(self, name, at, radius, stiffness, max_force):
+            asked.append((at, radius))
+            if radius and at != (0.5, 0, 0):
+                raise BadInput("grab: no free node")
+            return "held"
+
+    moving = iter(np.array([[[9, 9, 9], [x, 0, 0]]]).squeeze() for x in (0.1, 0.5))
+    grab, start = take_hand(Client(), 1, lambda: next(moving))
+    assert (grab, tuple(start)) == ("held", (0.5, 0, 0)) and len(asked) == 2
+    asked.clear()
+    take_hand(Client(), 0, lambda: np.zeros((2, 3)))
+    assert asked[-1][1] == 0 and all(radius for _, radius in asked[:-1]) and len(asked) > 5

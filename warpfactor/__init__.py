@@ -2,6 +2,7 @@
 """Soft bodies in real time, from Python: `import warpfactor as wf`.
 
 wf.Simulation, wf.Scene, wf.Mesh   simulate in this process; they need the extra server
+wf.sweep                           one scene at many values: a table
 wf.Client                          a server that runs: push, grab, watch, steer
 wf.Log                             what a run has recorded
 wf.gym                             environments of gymnasium; they need the extra gym
@@ -19,8 +20,9 @@ if TYPE_CHECKING:
     from clients.log.reader import Log
     from sim_server import gym
     from sim_server.embedded import Mesh, Scene, Simulation
+    from sim_server.embedded.sweep import sweep
 
-__all__ = ["Client", "Log", "Mesh", "Scene", "Simulation", "gym"]
+__all__ = ["Client", "Log", "Mesh", "Scene", "Simulation", "gym", "sweep"]
 
 _PLACES = {
     "Client": "clients.client",
@@ -29,6 +31,7 @@ _PLACES = {
     "Scene": "sim_server.embedded",
     "Simulation": "sim_server.embedded",
     "gym": "sim_server.gym",
+    "sweep": "sim_server.embedded.sweep",
 }
 
 

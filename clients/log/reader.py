@@ -72,7 +72,7 @@ class Log:
     @property
     def complete(self) -> bool:
         """True if the file was closed by its writer and every block of it could be read."""
-        return self._file.complete and not self._file.problems and not self._malformed
+        return self._file.whole and not self._malformed
 
     @property
     def notes(self) -> list[str]:

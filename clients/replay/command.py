@@ -16,6 +16,7 @@ from clients.replay.player import Player, speed_of
 from clients.replay.replay_server import ReplayServer
 from clients.replay.timeline import Timeline
 from protocol.channels import SERVER_NAME
+from protocol.log_pieces import size_of_log
 from protocol.printable import printable
 from protocol.process.own_python import own_module
 
@@ -29,7 +30,7 @@ def republish(
     last = math.inf if end is None else end
     if not 0 <= begin <= last or math.isnan(last):
         raise BadInput(f"--from {begin:g} --to {last:g}: allowed are 0 <= from <= to, s of simulation")
-    with progress_bar("reading", log.stat().st_size if log.is_file() else 0) as progress:
+    with progress_bar("reading", size_of_log(log)) as progress:
         timeline = Timeline(log, progress)
     with timeline:
         for note in timeline.notes:

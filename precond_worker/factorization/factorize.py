@@ -49,7 +49,7 @@ class Analysis:
     def __init__(self, row_start: ArrayLike, columns: ArrayLike, library: str = "auto"):
         """row_start (nodes + 1,), columns (blocks,): block rows, both triangles, columns ascending.
 
-        library: one of LIBRARIES; auto: CHOLMOD, or without it native code of our own, supernodal. Raises ValueError
+        library: one of LIBRARIES; auto: native code of our own, supernodal. Raises ValueError
         for a malformed pattern, ImportError if the library is not installed, errors.DeviceUnusable without a GPU,
         sim_server.backends.compiler.CompileError without a C++ compiler for supernodal.
         """
@@ -115,17 +115,13 @@ def open_library(library: str, row_start: Int32, columns: Int32) -> Library:
 
 
 def default_library() -> str:
-    """Returns what "auto" stands for: CHOLMOD where scikit-sparse is installed, else supernodal.
+    """Returns what "auto" stands for on a CPU: supernodal.
 
-    The environment variable WARPFACTOR_FACTORIZATION forces one of ON_CPU; raises ValueError if it names another.
+    It takes less time than CHOLMOD at every size that was measured (docs/bench/factors.md), and steps take as many
+    iterations. The environment variable WARPFACTOR_FACTORIZATION forces one of ON_CPU; raises ValueError if it names
+    another.
     """
     forced = os.environ.get(CHOICE, "")
     if forced not in ("", *ON_CPU):
         raise ValueError(f"{CHOICE}={forced}, allowed: {', '.join(ON_CPU)}")
-    if forced:
-        return forced
-    try:
-        import sksparse.cholmod  # noqa: F401
-    except ImportError:
-        return "supernodal"
-    return "cholmod"
+    return forced or "supernodal"

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Complete factors by native code of our own (native/multifrontal.cpp) on the BLAS that SciPy brings.
 
-It is the default where scikit-sparse is not installed. Supernodes, and so the pattern of L, are those of CHOLMOD.
+It is the default. Supernodes, and so the pattern of L, are those of CHOLMOD.
 """
 
 import ctypes as c

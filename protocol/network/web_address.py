@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Where the page of `sim-client web` is served: HOST:PORT, and whether it can be."""
+"""Where pages and metrics are served: HOST:PORT, and whether the page of `sim-client web` can be."""
 
 import ipaddress
 import re
@@ -14,14 +14,17 @@ HOST, PORT = "127.0.0.1", 8080
 _ADDRESS = re.compile(r"(?:(?P<host>\[[0-9A-Fa-f:.%\w]+\]|[^:\s/\[\]]*):)?(?P<port>\d{1,5})")
 
 
-def web_address(text: str) -> tuple[str, int]:
-    """Returns host and port of HOST:PORT, :PORT, PORT, or of an IP address or localhost alone. Raises Refused."""
+def web_address(text: str, option: str = "--web", port: int = PORT) -> tuple[str, int]:
+    """Returns host and port of HOST:PORT, :PORT, PORT, or of an IP address or localhost alone, with the port `port`.
+
+    Raises Refused, which names the option.
+    """
     if text == "localhost" or _is_ip(text.strip("[]")):
-        return text.strip("[]"), PORT
+        return text.strip("[]"), port
     match = _ADDRESS.fullmatch(text)
     if match is None or not 1 <= int(match["port"]) <= 65535:
-        allowed = f"HOST:PORT or PORT, PORT from 1 to 65535, for example {HOST}:{PORT}"
-        raise Refused(f"--web {text}: allowed is {allowed}", "malformed")
+        allowed = f"HOST:PORT or PORT, PORT from 1 to 65535, for example {HOST}:{port}"
+        raise Refused(f"{option} {text}: allowed is {allowed}", "malformed")
     return (match["host"] or HOST).strip("[]"), int(match["port"])
 
 

@@ -9,13 +9,15 @@ from pathlib import Path
 CHECKOUT = Path(__file__).parents[2]
 EXTRAS = {  # modules of each extra of pyproject.toml; a module of several stands at the smaller one
     "mesh": ("meshio", "pytetwild"),
-    "server": ("mcap_protobuf", "pydantic", "pydantic_core", "pymetis", "scipy"),
+    "server": ("loky", "mcap_protobuf", "pydantic", "pydantic_core", "pymetis", "scipy"),
     "gpu": ("cupy", "cupyx"),
     "view": ("matplotlib", "mpl_toolkits", "PIL", "plotly", "rerun"),
     "web": ("viser", "websockets"),
     "export": ("foxglove", "h5py", "imageio_ffmpeg", "pxr"),
     "gym": ("gymnasium",),
     "identify": ("optuna",),
+    "slurm": ("submitit",),
+    "metrics": ("prometheus_client",),
 }
 
 

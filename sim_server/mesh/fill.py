@@ -3,7 +3,8 @@
 
 fTetWild meshes an envelope around the surface: nodes are up to `envelope` away from it, and gaps, overlaps and open
 borders are closed somehow. So the volume of the mesh is compared with the volume that the surface encloses. It gives
-another mesh each time that it is asked, so meshes are kept, and a log holds its own.
+another mesh each time that it is asked, so meshes are kept, and a log holds its own. It runs in a process and a folder
+of its own (fill_process.py), as it leaves files where it runs.
 
 Source: Hu, Schneider, Wang, Zorin, Panozzo, Fast Tetrahedral Meshing in the Wild, 2020.
 """
@@ -11,15 +12,14 @@ Source: Hu, Schneider, Wang, Zorin, Panozzo, Fast Tetrahedral Meshing in the Wil
 import hashlib
 import logging
 import os
+import subprocess
 import sys
+import tempfile
 import time
-import types
 import zipfile
-from importlib import import_module
 from importlib.util import find_spec
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from scipy.sparse import coo_array
@@ -38,6 +38,7 @@ log = logging.getLogger(__name__)
 
 FORM = "1"  # of what the cache holds; another one finds nothing of this one
 ENVELOPE = 1e-3  # of the diagonal of the surface's box, where a scene says nothing
+EVERY = 10.0  # s between lines that say that a surface is still being filled
 TOLD, ALLOWED = 0.02, 0.25  # differences of the volumes, relative, that are told, and above which a mesh is refused
 
 
@@ -80,16 +81,13 @@ def tetrahedra_inside(
     path: Path, points: Float64, triangles: Int64, edge: float, envelope: float
 ) -> tuple[Float64, Int32]:
     """Returns nodes and tetrahedra of positive volume. envelope: over the diagonal [-]. Raises InputError."""
-    try:
-        tetrahedralize = pytetwild().tetrahedralize
-    except ImportError as error:
-        raise InputError(
-            f"mesh {path}: filling a surface with tetrahedra needs pytetwild ({error}): {to_install('mesh')}"
-        ) from error
-    try:
-        rest, tets = tetrahedralize(points, triangles.astype(np.int32), edge_length_abs=edge, epsilon=envelope)
-    except (RuntimeError, ValueError) as error:
-        raise InputError(f"mesh {path}: pytetwild cannot fill it ({error})") from error
+    if find_spec("pytetwild") is None:
+        raise InputError(f"mesh {path}: filling a surface with tetrahedra needs pytetwild: {to_install('mesh')}")
+    with tempfile.TemporaryDirectory() as folder:
+        np.savez(Path(folder) / "surface.npz", points=points, triangles=triangles, edge=edge, envelope=envelope)
+        run_in(path, Path(folder))
+        with np.load(Path(folder) / "mesh.npz", allow_pickle=False) as made:
+            rest, tets = made["rest"], made["tets"]
     if not len(tets):
         raise InputError(f"mesh {path}: there is nothing inside it: is it a closed surface?")
     used, numbered = np.unique(tets, return_inverse=True)
@@ -99,15 +97,27 @@ def tetrahedra_inside(
     return rest, tets
 
 
-def pytetwild() -> Any:
-    """Returns the package. It (0.4) imports pyvista, which it does not require and which filling does not need."""
-    if find_spec("pyvista") is not None or "pyvista" in sys.modules:
-        return import_module("pytetwild")
-    sys.modules["pyvista"] = types.ModuleType("pyvista")
-    try:
-        return import_module("pytetwild")
-    finally:
-        del sys.modules["pyvista"]
+def run_in(path: Path, folder: Path) -> None:
+    """Runs fill_process.py in a folder, and says now and then that it does. Raises InputError with what it said."""
+    begun, script = time.perf_counter(), Path(__file__).with_name("fill_process.py")
+    said = folder / "said.txt"
+    with said.open("wb") as sink:
+        command = [sys.executable, "-P", str(script)]  # -P: without the folder of the script in front of libraries
+        with subprocess.Popen(command, cwd=folder, stdout=sink, stderr=sink) as process:
+            try:
+                while True:
+                    try:
+                        code = process.wait(EVERY)
+                        break
+                    except subprocess.TimeoutExpired:
+                        log.warning("mesh %s: still being filled, %.0f s", path.name, time.perf_counter() - begun)
+            except BaseException:
+                process.kill()
+                raise
+    if code:
+        lines = said.read_text(errors="replace").strip().splitlines()
+        reason = lines[-1] if lines else f"it ended with code {code}"
+        raise InputError(f"mesh {path}: pytetwild cannot fill it ({reason})")
 
 
 def _parts(mesh: Mesh) -> str:

@@ -22,9 +22,12 @@ COMPRESSIONS = {"lz4": CompressionType.LZ4, "zstd": CompressionType.ZSTD, "none"
 
 
 class McapFile:
-    """Writes a file; registers channels and schemas at their first message. Raises InputError if it cannot be made."""
+    """Writes a file; registers channels and schemas at their first message. Raises InputError if it cannot be made.
 
-    def __init__(self, path: Path, compression: str, overwrite: bool) -> None:
+    origin: what is written at its start beside the version of the protocol
+    """
+
+    def __init__(self, path: Path, compression: str, overwrite: bool, origin: dict[str, str] | None = None) -> None:
         if compression not in COMPRESSIONS:
             raise InputError(f"recording: compression = {compression!r}: allowed are {', '.join(COMPRESSIONS)}")
         try:
@@ -38,7 +41,7 @@ class McapFile:
         self._schemas: dict[type[Message], int] = {}
         self._channels: dict[str, int] = {}
         self._writer.start(profile=PROFILE)
-        self._writer.add_metadata("warpfactor", {"protocol": str(PROTOCOL)})
+        self._writer.add_metadata("warpfactor", {"protocol": str(PROTOCOL), **(origin or {})})
 
     def write(
         self, topic: str, kind: type[Message], log_time: int, publish_time: int, sequence: int, data: bytes
@@ -52,24 +55,29 @@ class McapFile:
     def flush(self) -> None:
         """Ends the chunk in progress and writes all to the operating system. Raises OSError."""
         self._writer.flush()
-        self._check_exists()
+        self.check_exists()
+
+    def check_exists(self) -> None:
+        """Raises OSError if the file was removed: its contents would be lost when it is closed."""
+        if self._linked and os.fstat(self._stream.fileno()).st_nlink == 0:
+            raise OSError(errno.ENOENT, "the file was removed or replaced")
 
     def finish(self, notes: dict[str, str]) -> None:
         """Writes `notes` and the index, and closes. Raises OSError."""
         self._writer.add_metadata("recorder", notes)
         self._writer.finish()
-        self._check_exists()
+        self.check_exists()
         self._stream.close()
+
+    @property
+    def size(self) -> int:
+        """Bytes given to the file so far; those of the chunk in progress are not among them. 0 once it is closed."""
+        return 0 if self._stream.closed else self._stream.tell()
 
     def abandon(self) -> None:
         """Closes the file without an index after an error; flushed chunks stay readable."""
         with contextlib.suppress(OSError, ValueError):
             self._stream.close()
-
-    def _check_exists(self) -> None:
-        """Raises OSError if the file was removed: its contents would be lost when it is closed."""
-        if self._linked and os.fstat(self._stream.fileno()).st_nlink == 0:
-            raise OSError(errno.ENOENT, "the file was removed or replaced")
 
     def _register(self, topic: str, kind: type[Message]) -> int:
         if kind not in self._schemas:

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""Writes the messages of a run to a log, an MCAP file that describes itself.
+"""Writes the messages of a run to a log, MCAP files that describe themselves.
 
-The caller serializes a message and appends it to a queue; one thread compresses and writes. The file is a sequence of
+The caller serializes a message and appends it to a queue; one thread compresses and writes. A file is a sequence of
 complete chunks, flushed every FLUSH_SECONDS, so that after `kill -9` it is readable up to the last flush.
 """
 
@@ -13,32 +13,25 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
 from google.protobuf.message import Message
 
 from protocol import messages_pb2 as pb
-from sim_server.recording.mcap_file import McapFile
+from sim_server.errors import InputError
+from sim_server.recording.pieces import Pieces, Record
+from sim_server.recording.rotation import Rotation
 
 FLUSH_SECONDS = 1.0  # age of the oldest record that a crash may lose
+LOOK_SECONDS = 0.5  # between two looks whether the file is still there, and whether there is room for a new one
+LONGEST_PAUSE = 30.0  # between two attempts to begin a new file, if there is room and it fails all the same
 FRAME_BYTES = 64 << 20  # of all records that wait for the disk; above it frames are dropped
 TOTAL_BYTES = 256 << 20  # the same; above it all records are lost
 
 Compression = Literal["lz4", "zstd", "none"]
 
 log = logging.getLogger(__name__)
-
-
-@dataclass(frozen=True)
-class _Record:
-    topic: str
-    kind: type[Message]
-    log_time: int  # ns of simulation
-    publish_time: int  # ns of Unix time
-    sequence: int
-    data: bytes
 
 
 class Recorder:
@@ -50,8 +43,9 @@ class Recorder:
 
     Appending does not wait for the disk unless `block` is true (for runs without a pace). While more than FRAME_BYTES
     wait, states are dropped and counted in `dropped`; other records are kept up to TOTAL_BYTES, and counted in `lost`
-    beyond that. Both numbers are written at the end of the file. A disk error, or the file's removal, ends the
-    recording, is reported once through `report` and kept in `failure`; later messages are ignored.
+    beyond that. Both numbers are written at the end of the file. After a disk error, or the file's removal, messages
+    are lost and counted until there is room for a new file, in which the recording goes on; both is reported through
+    `report`, and `failure` says what is missing. rotation: when a new file is begun else.
 
     Raises InputError if the file cannot be created, if it is there already and not to be overwritten, or for an
     unknown compression.
@@ -66,25 +60,29 @@ class Recorder:
         report: Callable[[str], None] = log.error,
         frame_bytes: int = FRAME_BYTES,
         total_bytes: int = TOTAL_BYTES,
+        rotation: Rotation = Rotation(),  # noqa: B008  frozen
     ) -> None:
         self.path = Path(path)
         self.dropped = 0  # frames
         self.lost = 0  # records of other kinds
         self.written = 0  # records handed to the file
-        self.failure = ""
+        self.bytes_written = 0
+        self.failure = ""  # why the log is not whole
+        self.broken = False  # it is not written now
         self._report = report
         self._frame_bytes, self._total_bytes = frame_bytes, total_bytes
-        self._waiting: deque[_Record] = deque()
+        self._waiting: deque[Record] = deque()
         self._waiting_bytes = 0
         self._time = 0  # ns of simulation, newest seen; stamps what has no time of its own
         self._closing = False
         self._changed = threading.Condition()
-        self._file = McapFile(self.path, compression, overwrite)
+        self._missing = 0  # records since it broke off
+        self._pieces = Pieces(self.path, compression, overwrite, rotation)
         self._thread = threading.Thread(target=self._write_all, name="recorder", daemon=True)
         self._thread.start()
 
     def scene(self, message: pb.Scene, block: bool = False) -> None:
-        self._append("/scene", message, 0, 0, block)
+        self._append("/scene", message, 0, 0, block, repeat="scene")
 
     def topology(
         self, message: pb.Topology, block: bool = False, time: float | None = None, again: bool = False
@@ -95,10 +93,12 @@ class Recorder:
         """
         stamp = self._time if time is None else self._stamp(time)
         topic, sequence = f"/topology/{message.header.object}", message.header.epoch + message.cut
-        return self._append(topic, message, stamp, sequence, block, counts=not again)
+        repeat = topic if message.tets or not message.cut else f"{topic}/cut"
+        return self._append(topic, message, stamp, sequence, block, counts=not again, repeat=repeat)
 
     def obstacle(self, message: pb.Obstacle, block: bool = False) -> None:
-        self._append(f"/obstacle/{message.header.object}", message, self._time, 0, block)
+        topic = f"/obstacle/{message.header.object}"
+        self._append(topic, message, self._time, 0, block, repeat=topic)
 
     def pose(self, message: pb.ObstaclePose, block: bool = False) -> None:
         """Appends where an obstacle is at a frame."""
@@ -163,17 +163,22 @@ class Recorder:
             self.dropped += 1
 
     def _append(
-        self, topic: str, message: Message, log_time: int, sequence: int, block: bool, counts: bool = True
+        self, topic: str, message: Message, log_time: int, sequence: int, block: bool, counts: bool = True,
+        repeat: str = "",
     ) -> bool:  # fmt: skip
-        """Returns False if there is no room; counts: it is dropped or lost then. True after the end of the log."""
-        record = _Record(
-            topic, type(message), log_time, time.time_ns(), sequence & 0xFFFFFFFF, message.SerializeToString()
+        """Returns False if there is no room; counts: it is dropped or lost then. True after the end of the log, or
+        while it is broken: what each file begins with is kept for the next one."""
+        record = Record(
+            topic, type(message), log_time, time.time_ns(), sequence & 0xFFFFFFFF, message.SerializeToString(), repeat
         )
         limit = self._frame_bytes if isinstance(message, pb.State) else self._total_bytes
         with self._changed:
             if block:
-                self._changed.wait_for(lambda: self._fits(record, self._frame_bytes) or self.failure or self._closing)
-            if self._closing or self.failure:
+                self._changed.wait_for(lambda: self._fits(record, self._frame_bytes) or self.broken or self._closing)
+            if self._closing:
+                return True
+            if self.broken:
+                self._miss(record)
                 return True
             if not block and not self._fits(record, limit):
                 if counts:
@@ -184,10 +189,19 @@ class Recorder:
             self._changed.notify_all()
             return True
 
-    def _fits(self, record: _Record, limit: int) -> bool:
+    def _miss(self, record: Record) -> None:
+        """Counts a record that came while the log was broken."""
+        self._pieces.repeated.note(record)
+        self._missing += 1
+        if record.kind is pb.State:
+            self.dropped += 1
+        else:
+            self.lost += 1
+
+    def _fits(self, record: Record, limit: int) -> bool:
         return not self._waiting or self._waiting_bytes + len(record.data) <= limit
 
-    def _count_dropped(self, record: _Record) -> None:
+    def _count_dropped(self, record: Record) -> None:
         if record.kind is pb.State:
             self.dropped += 1
             return
@@ -196,42 +210,75 @@ class Recorder:
             self._report(f"{self.path}: the disk is too slow, {self._total_bytes >> 20} MiB wait: records are lost")
 
     def _write_all(self) -> None:
-        try:
-            self._write_until_closed()
-            self._file.finish({"frames_dropped": str(self.dropped), "records_lost": str(self.lost)})
-        except Exception as error:  # whatever it is, the simulation goes on
-            self._file.abandon()
+        while True:
+            try:
+                self._write_until_closed()
+                self._pieces.finish(self._notes())
+                return
+            except Exception as error:  # whatever it is, the simulation goes on
+                self._break_off(error)
+            if not self._go_on():
+                return
+
+    def _notes(self) -> dict[str, int]:
+        return {"frames_dropped": self.dropped, "records_lost": self.lost}
+
+    def _break_off(self, error: Exception) -> None:
+        """Leaves the file; records are lost from now on."""
+        self._pieces.abandon()
+        with self._changed:
+            why = getattr(error, "strerror", None) or error
+            self.failure = f"{self._pieces.path}: recording stopped after {self.written} records: {why}"
+            self.broken, self._missing = True, 0
+            for record in self._waiting:
+                self._miss(record)
+            self._waiting.clear()
+            self._waiting_bytes = 0
+            self._changed.notify_all()
+        self._report(self.failure)
+
+    def _go_on(self) -> bool:
+        """Waits until there is room, and begins a new file; returns False if the recorder is closed before."""
+        pause = LOOK_SECONDS
+        while True:
             with self._changed:
-                why = getattr(error, "strerror", None) or error
-                self.failure = f"{self.path}: recording stopped after {self.written} records: {why}"
-                self._waiting.clear()
-                self._changed.notify_all()
-            self._report(self.failure)
+                if self._changed.wait_for(lambda: self._closing, pause):
+                    return False
+                if not self._pieces.may_go_on():
+                    continue
+                try:
+                    self._pieces.go_on()
+                except (OSError, InputError):
+                    pause = min(2 * pause, LONGEST_PAUSE)
+                    continue
+                then = f"it goes on in {self._pieces.path}, {self._missing} records are missing"
+                self.failure += f"; {then}"
+                self.broken = False
+            self._report(f"{self.path}: {then}")
+            return True
 
     def _write_until_closed(self) -> None:
         flushed = time.monotonic()
         unflushed = False
         while True:
-            due = flushed + FLUSH_SECONDS - time.monotonic() if unflushed else None
-            batch, closing = self._next_batch(due)
+            batch, closing = self._next_batch(LOOK_SECONDS)
             for record in batch:
-                self._file.write(
-                    record.topic, record.kind, record.log_time, record.publish_time, record.sequence, record.data
-                )
+                self._pieces.write(record)
                 self.written += 1
+            self.bytes_written = self._pieces.bytes_written
             unflushed = unflushed or bool(batch)
-            if unflushed and time.monotonic() - flushed >= FLUSH_SECONDS:
-                self._file.flush()
-                flushed, unflushed = time.monotonic(), False
+            now = time.monotonic()
+            if unflushed and now - flushed >= FLUSH_SECONDS:
+                self._pieces.flush()
+                flushed, unflushed = now, False
             if closing and not batch:
                 return
+            self._pieces.look(self._notes())
 
-    def _next_batch(self, timeout: float | None) -> tuple[list[_Record], bool]:
+    def _next_batch(self, timeout: float) -> tuple[list[Record], bool]:
         with self._changed:
-            self._changed.wait_for(
-                lambda: self._waiting or self._closing, timeout if timeout is None else max(timeout, 0)
-            )
-            batch: list[_Record] = []
+            self._changed.wait_for(lambda: self._waiting or self._closing, timeout)
+            batch: list[Record] = []
             size = 0
             while self._waiting and size < 1 << 20:  # a chunk at most, so that the flush stays on time
                 batch.append(self._waiting.popleft())

@@ -193,6 +193,8 @@ class Recording:
             raise BadLog(f"{self.path}: the log holds no scene; its beginning is damaged")
         if missing := [name for name in self.scene.objects if self.objects[name].topology is None]:
             raise BadLog(f"{self.path}: the log holds no mesh of {', '.join(missing)}; it is damaged")
+        if self._file.begins_late:
+            raise BadLog(f"{self.path}: the first file of this log is gone, without which no run can be repeated")
         if self.steps <= self.first:
             raise BadLog(f"{self.path}: the log holds no step that could be repeated")
         if self.device == "gpu" and self.touched and not self.touch:

@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from protocol import messages_pb2 as pb
+from protocol.process.notify import Notifier
 from protocol.process.nvidia import nvidia_device
 from protocol.process.version import version
 from sim_server.arrays import Float64
@@ -34,6 +35,7 @@ from sim_server.recording.recorder import Recorder
 from sim_server.service.between_steps import BetweenSteps
 from sim_server.service.commands import Commands
 from sim_server.service.halts import Halts
+from sim_server.service.health import Health
 from sim_server.service.pace import LOOK_PERIOD, PaceMonitor
 from sim_server.service.tearing import Tearing
 from sim_server.service.telemetry import Telemetry
@@ -100,6 +102,7 @@ class Service:
             restore_driver(self.driver, manifest, saved_factors(simulation, resume, manifest))
         self._last = None if steps is None else self.engine.step + steps
         self.telemetry.open(resume)
+        self.health = Health(Notifier())
 
     def _first_factors(self, realtime: bool) -> FirstFactors | None:
         """Returns the first factors that the first step waits for; None: it goes without."""
@@ -177,6 +180,7 @@ class Service:
         if not self._awaits_factors():
             self._check_pace()
         self.commands.release_absent(set(self.link.clients()))
+        self.health.look(self.engine.step, self.commands.engine_paused or self._first is not None)
         self.telemetry.publish_status(self._state(), force=False)
 
     def _carry_out(self) -> None:

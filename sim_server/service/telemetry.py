@@ -5,7 +5,7 @@ import os
 import time
 from collections import Counter, deque
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,6 +32,9 @@ from sim_server.service.reaction_telemetry import ReactionTelemetry
 from sim_server.simulation import Simulation
 from sim_server.updates.driver import Driver
 
+if TYPE_CHECKING:
+    from sim_server.service.metrics import ServerMetrics  # prometheus_client is there only where it is wanted
+
 STEPS_PERIOD = 0.05  # s between batches of step records
 STATE_PERIOD = 1 / 30  # s between states for viewers
 STATUS_PERIOD = 1.0  # s
@@ -48,6 +51,7 @@ class Telemetry:
     commands: whose interactions are in the status; None: there are none
 
     contact: the part that tells of obstacles
+    metrics: is given records and statuses; None: nobody asks for it
     reactions: the part that sends forces as they come
     """
 
@@ -92,6 +96,7 @@ class Telemetry:
         self._points: list[NamedPoints] = []
         self._stale_moduli: set[str] = set()  # keys of parameters that were set
         self.simulation.parameters.on_set.append(self._on_set)
+        self.metrics: ServerMetrics | None = None
 
     def open(self, resumed: Checkpoint | None = None) -> None:
         """Sends scene, topologies and the initial state, before anything else, to log and network.
@@ -130,6 +135,8 @@ class Telemetry:
         if self.replay_recorder:
             self.replay_recorder.write(self.patient)
         if len(records):
+            if self.metrics is not None:
+                self.metrics.add(records)
             self.seconds.extend(records["whole"][records["body"] == 0].tolist())
             self.update_summary(records, reactions, readings)
             self.reactions.publish(records, reactions)
@@ -346,6 +353,8 @@ class Telemetry:
         if where:
             messages.add_places(self._places(), status)
         self.link.publish_status(status)
+        if self.metrics is not None:
+            self.metrics.status = status
 
     def _places(self) -> list[NamedPoints]:
         """Returns the named points of all objects at their present positions."""

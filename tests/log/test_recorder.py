@@ -105,12 +105,16 @@ class _StuckFile:
         self.go = threading.Event()
         self.topics: list[str] = []
         self.notes: dict[str, str] = {}
+        self.size = 0
 
     def write(self, topic: str, *_: object) -> None:
         assert self.go.wait(30)
         self.topics.append(topic)
 
     def flush(self) -> None:
+        pass
+
+    def check_exists(self) -> None:
         pass
 
     def finish(self, notes: dict[str, str]) -> None:
@@ -120,7 +124,7 @@ class _StuckFile:
 @pytest.fixture
 def stuck(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> _StuckFile:
     file = _StuckFile()
-    monkeypatch.setattr("sim_server.recording.recorder.McapFile", lambda *_: file)
+    monkeypatch.setattr("sim_server.recording.pieces.McapFile", lambda *_: file)
     return file
 
 

@@ -92,10 +92,7 @@ def test_a_run_is_repeated_without_the_surface_and_what_fills_it(tmp_path, fille
 
 
 def test_without_pytetwild_the_extra_is_named(tmp_path, monkeypatch):
-    def missing():
-        raise ModuleNotFoundError("No module named 'pytetwild'")
-
-    monkeypatch.setattr(fill, "pytetwild", missing)
+    monkeypatch.setattr(fill, "find_spec", lambda name: None)
     with pytest.raises(InputError) as error:
         fill.filled(write(tmp_path / "box.stl"), 0.5)
     assert "needs pytetwild" in str(error.value) and "pip install" in str(error.value) and "mesh]" in str(error.value)
@@ -104,10 +101,27 @@ def test_without_pytetwild_the_extra_is_named(tmp_path, monkeypatch):
 
 
 @needs_pytetwild
-def test_a_box_is_filled(tmp_path):
-    """To its volume, within the envelope; from then on the mesh is that of the cache."""
+def test_a_box_is_filled(tmp_path, monkeypatch):
+    """To its volume, within the envelope; from then on the mesh is that of the cache. Nothing is left behind."""
+    (here := tmp_path / "here").mkdir()
+    monkeypatch.chdir(here)
     mesh = fill.filled(write(tmp_path / "box.stl"), 0.7)
     assert abs(mesh.volumes.sum() / 2 - 1) < 0.02 and mesh.volumes.min() > 0
     scene = tmp_path / "scene.toml"
     scene.write_text('dt = 0.1\n[[object]]\nname = "a"\nmesh = { surface = "box.stl", edge = 0.7 }\n')
     assert np.array_equal(load(scene).objects[0].load_mesh().tets, mesh.tets)
+    assert list(here.iterdir()) == []
+
+
+@needs_pytetwild
+def test_what_cannot_be_filled_is_told(tmp_path, cache):
+    """What the process that fills says last; the next call asks it again."""
+    flat = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]], float)
+    with pytest.raises(InputError, match=r"flat.stl: (there is nothing inside it|pytetwild cannot fill it \(.+\))"):
+        fill.tetrahedra_inside(tmp_path / "flat.stl", flat, np.array([[0, 1, 2], [1, 3, 2]]), 0.5, 1e-3)
+
+
+def test_a_process_that_fails_is_an_error_of_the_mesh(tmp_path):
+    """Without its surface; the message ends with the last line that it wrote."""
+    with pytest.raises(InputError, match=r"box.stl: pytetwild cannot fill it \(.*surface.npz"):
+        fill.run_in(tmp_path / "box.stl", tmp_path)

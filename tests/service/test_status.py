@@ -36,9 +36,9 @@ def test_the_client_shows_these_numbers():
     text = io.StringIO()
     Console(width=200, file=text).print(tables(pb.Status(frames_dropped=4, records_dropped=51, records_lost=62)))
     assert "dropped: frames 4, step records 51; lost to the log 62" in text.getvalue()
-    assert "no log any more" not in text.getvalue()
+    assert "the log is not whole" not in text.getvalue()
     Console(width=200, file=text).print(tables(pb.Status(recording_failure="/x.mcap: No space left on device")))
-    assert "no log any more: /x.mcap: No space left on device" in text.getvalue()
+    assert "the log is not whole: /x.mcap: No space left on device" in text.getvalue()
 
 
 def test_what_goes_wrong_is_counted_by_object_and_shown():

@@ -68,7 +68,7 @@ def test_a_full_disk_is_told_and_the_exit_code_is_1(pace: str, tmp_path: Path) -
     assert done.returncode == 1 and "Traceback" not in done.stderr, done.stderr
     assert "shared memory is off, arrays travel as bytes: files may have 9 KiB" in done.stderr
     assert done.stderr.count("recording stopped after") == 1 and "File too large" in done.stderr
-    assert f"exit code 1: the log {log} ends before the run does" in done.stderr
+    assert f"exit code 1: the log {log} is not whole" in done.stderr
     assert "60 steps" in done.stdout
 
 

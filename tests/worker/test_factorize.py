@@ -227,24 +227,18 @@ def test_the_environment_chooses_the_library(monkeypatch):
         default_library()
 
 
-def test_without_scikit_sparse_our_own_is_the_default(monkeypatch):
+def test_our_own_is_the_default_also_where_scikit_sparse_is(monkeypatch):
+    """Which is asked for by its name, and told to be missing then."""
     graph = GRAPHS["two nodes"]
     monkeypatch.delenv(CHOICE, raising=False)
-    for module in ("sksparse", "sksparse.cholmod"):
-        monkeypatch.setitem(sys.modules, module, None)
     assert default_library() == Analysis(*graph).library == "supernodal"
     monkeypatch.setenv(CHOICE, "cholmod")
     assert default_library() == "cholmod"
+    for module in ("sksparse", "sksparse.cholmod"):
+        monkeypatch.setitem(sys.modules, module, None)
     monkeypatch.delitem(sys.modules, "precond_worker.factorization.cholmod", raising=False)
     with pytest.raises(ImportError):
         Analysis(*graph)
-
-
-@both
-def test_cholmod_is_the_default_where_it_is_installed(monkeypatch):
-    monkeypatch.delenv(CHOICE, raising=False)
-    assert default_library() == "cholmod"
-    assert Analysis(*GRAPHS["one node"]).library.startswith("cholmod ")
 
 
 @st.composite

@@ -141,7 +141,8 @@ class GpuEngine(DeviceLoop):
             parts = newton.parts[len(self._first) :]
             newton = Newton(newton.options, newton.dx_dv, parts, newton.detect, **newton.arrays)
             self._newton = NewtonIteration(
-                gpu, device, newton, assemble, ranges, arrays, phases, self.solver, newton_results, settled, search
+                gpu, device, newton, assemble, ranges, arrays, phases, self.solver, newton_results, settled, search,
+                within=given.held is None,
             )  # fmt: skip
         self._splits: DeviceSplits | None = None
         if most_blocks:
@@ -220,7 +221,8 @@ class GpuEngine(DeviceLoop):
             self._stamp_begin = self._stages.stamp_begin
         else:
             epilogue = Epilogue(EPILOGUE.checked(), "StepEpilogue", "finish_step", self._epilogue)
-            self._integrate = FusedKernel(integrate, epilogue)
+            ending = self._newton.ending() if self._newton else None
+            self._integrate = FusedKernel(integrate, epilogue, opening=ending)
             self._stamp_begin = self._integrate.function("stamp_begin")
         self._known: Float64 = arrays["values"]  # as a factor is to know them
         self._matrix = self._matrix_launches(assemble) if alone else ()

@@ -1,0 +1,95 @@
+# SPDX-License-Identifier: MIT
+"""When a log goes on in a new file, and which of its files are kept (`--record-rotate`, `--record-keep`)."""
+
+from __future__ import annotations
+
+import contextlib
+import re
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from protocol.log_pieces import later_pieces
+from sim_server.errors import InputError
+
+UNITS = {"B": 1, "KB": 10**3, "MB": 10**6, "GB": 10**9, "TB": 10**12, "KIB": 2**10, "MIB": 2**20, "GIB": 2**30}
+TIMES = {"S": 1.0, "MIN": 60.0, "H": 3600.0, "D": 86400.0}
+LEAST_BYTES, LEAST_SECONDS = 10**6, 1.0
+_VALUE = re.compile(r"(\d+(?:\.\d+)?)\s*([A-Za-z]+)")
+
+
+@dataclass(frozen=True)
+class Rotation:
+    """bytes, seconds: after which a new file is begun. keep: bytes of all files together. None: no limit"""
+
+    bytes: float | None = None
+    seconds: float | None = None
+    keep: float | None = None
+
+    @classmethod
+    def of_options(cls, rotate: Sequence[str], keep: str | None) -> Rotation:
+        """Reads --record-rotate (sizes and times, of each the least) and --record-keep. Raises InputError."""
+        sizes, times = [], []
+        for text in rotate:
+            size, time = _measure(text, UNITS), _measure(text, TIMES)
+            if size is not None and size >= LEAST_BYTES:
+                sizes.append(size)
+            elif time is not None and time >= LEAST_SECONDS:
+                times.append(time)
+            else:
+                raise InputError(
+                    f"--record-rotate {text}: allowed is a size of at least 1MB, as 500MB or 2GiB, or a time of at "
+                    "least 1s, as 10min, 1h or 1d"
+                )
+        if keep is None:
+            return cls(min(sizes, default=None), min(times, default=None))
+        kept = _measure(keep, UNITS)
+        if kept is None or kept < 2 * LEAST_BYTES:
+            raise InputError(f"--record-keep {keep}: allowed is a size of at least 2MB, as 20GB")
+        if not rotate:
+            raise InputError("--record-keep goes with --record-rotate: only whole files are removed")
+        return cls(min([*sizes, kept / 2]), min(times, default=None), kept)
+
+    def due(self, size: int, age: float) -> bool:
+        """True if a file of this size and age is to be ended [bytes, s]."""
+        return (self.bytes is not None and size >= self.bytes) or (self.seconds is not None and age >= self.seconds)
+
+
+def _measure(text: str, units: dict[str, int] | dict[str, float]) -> float | None:
+    match = _VALUE.fullmatch(text.strip())
+    factor = units.get(match[2].upper()) if match else None
+    return float(match[1]) * factor if match and factor is not None else None
+
+
+class Kept:
+    """The files of a log that were ended, oldest first; removes the oldest of them to keep the budget."""
+
+    def __init__(self, rotation: Rotation):
+        self._rotation = rotation
+        self._ended: deque[tuple[Path, int]] = deque()
+        self.removed = 0
+
+    def add(self, path: Path, size: int) -> None:
+        """Adds a file that was ended."""
+        self._ended.append((path, size))
+
+    def keep_budget(self, current: int) -> None:
+        """Removes files until all fit the budget. current: bytes of the file in progress"""
+        total = current + sum(size for _, size in self._ended)
+        while self._rotation.keep is not None and self._ended and total > self._rotation.keep:
+            path, size = self._ended.popleft()
+            with contextlib.suppress(OSError):  # somebody has moved it away
+                path.unlink()
+            self.removed += 1
+            total -= size
+
+
+def remove_earlier(path: Path) -> None:
+    """Removes later pieces of an earlier log of this name, which is to be replaced. Other files are left alone."""
+    for _, piece in later_pieces(path):
+        with contextlib.suppress(OSError):
+            with piece.open("rb") as file:
+                ours = file.read(8) in (b"\x89MCAP0\r\n", b"")
+            if ours:
+                piece.unlink()
