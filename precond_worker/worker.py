@@ -66,6 +66,11 @@ class Worker:
         self.work()
 
     @property
+    def idle(self) -> bool:
+        """True if no job waits, taken in or not."""
+        return not self._pending and self._connection.received.idle
+
+    @property
     def waiting(self) -> int:
         """Number of jobs taken in and not done."""
         return len(self._pending)

@@ -133,7 +133,7 @@ class GpuEngine(DeviceLoop):
             phases.of_solves(errors) if phases else (), ATTEMPTS if stages else 0,
             given.contact is not None,
             given.contact is not None and bool(given.contact.surfaces or given.contact.ties), correction, errors,
-            budgets, most_blocks,
+            budgets, given.cut,
         )  # fmt: skip
         self._newton, newton_results = None, None
         if newton and phases:

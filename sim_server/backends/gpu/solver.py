@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from protocol.factor import FactorPattern
 from sim_server.arrays import Int32, Int64
+from sim_server.backends.base import CutInput
 from sim_server.backends.compiler import SOURCES
 from sim_server.backends.gpu.correction import FactorCorrection
 from sim_server.backends.gpu.cupy_types import DeviceArray, KernelFunction
@@ -60,7 +61,7 @@ class PcgSolver:
     correction: of factors for grabs and contacts; None: they are not corrected
     errors: True for a scene whose solves estimate the errors of positions (iterate_error.cuh)
     budgets: True for a scene whose solves may end by their wall time (step_budget.cuh); they estimate errors, too
-    most_blocks: of A of each body, where bodies may be split while steps run; none: the pattern of A stays
+    cut: what tells of nodes that lose elements, and how many blocks A has at most; None: no body can be cut
 
     followed: what follows the pattern of A then (`follow`), else None
     params: arguments of the kernel (PCG_ARGUMENTS)
@@ -75,12 +76,13 @@ class PcgSolver:
         self, gpu: Gpu, ranges: Sequence[tuple[int, int]], arrays: Mapping[str, NDArray[Any]], counter: DeviceArray,
         capacity: int, planes: int = 1, phases: Sequence[DeviceArray] = (), attempts: int = 0, contact: bool = False,
         between: bool = False, correction: FactorCorrection | None = None, errors: bool = False, budgets: bool = False,
-        most_blocks: Sequence[int] = (),
+        cut: CutInput | None = None,
     ):  # fmt: skip
         cp, processors = gpu.cp, gpu.properties["multiProcessorCount"]
         self.gpu, self.counter, self._capacity, self.planes, self._phases = gpu, counter, capacity, planes, phases
         self._attempts, self._contact, self._correction, self.errors = attempts, contact, correction, errors
-        self.budgets = budgets
+        self.budgets, self._cut = budgets, cut
+        most_blocks = cut.most_blocks if cut else ()
         self._twins = {name: gpu.twin(arrays[name]) for name in ("row_start", "values", "b", "y", "moving")}
         self.real = np.dtype(self._twins["values"].dtype)
         self._types = {"real": "float" if self.real == np.float32 else "double"}
@@ -119,6 +121,9 @@ class PcgSolver:
             "pool_counter": self.pool_counter, "results": self.results, "step": counter,
             "begun": cp.zeros(1, np.int64), "clocks": cp.zeros(len(ranges) * TRIAL_CLOCK.itemsize, np.uint8),
         }  # fmt: skip
+        if cut:
+            self._work["at_rest"] = gpu.twin(cut.at_rest)
+            assert self._work["at_rest"].dtype == self.real
         if self.followed:
             self._work["split_step"] = cp.zeros(len(ranges), np.int64)
         fixed = 5120 if correction else 2048  # bytes: shared memory that pcg.cu declares, and the driver's
@@ -181,6 +186,7 @@ class PcgSolver:
                 *(["-DCONTACT_PASSES"] if self._contact else []), *(["-DCORRECTED"] if corrected else []),
                 *(["-DERRORS"] if self.errors and name == "pcg" else []),
                 *(["-DBUDGETS"] if self.budgets and name == "pcg" else []),
+                *(["-DCUTS"] if self._cut and name == "pcg" else []),
                 *(["-DSPLITS"] if self.followed else []),
             ),
             backend="nvrtc",
