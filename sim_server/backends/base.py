@@ -237,7 +237,16 @@ class Engine(Protocol):
         ...
 
     def post_factor(self, body: int, pattern: FactorPattern, values: NDArray[Any], step: int) -> None:
-        """Copies a factor of the matrix of `step`; one of the next solves of the body takes it up."""
+        """Takes a factor of the matrix of `step`, whose values do not change any more; one of the next solves of the
+        body takes it up."""
+        ...
+
+    def prepare_for_factors(self) -> None:
+        """Begins what the first factor would wait for, without waiting."""
+        ...
+
+    def expect_factors(self, body: int, pattern: FactorPattern) -> None:
+        """Prepares for factors of a pattern that will come, without waiting."""
         ...
 
     def resume_factor(self, body: int, pattern: FactorPattern, values: NDArray[Any], step: int) -> None:

@@ -701,6 +701,12 @@ class CpuEngine(Reports):
         self._mail[body].waiting = buffer
         self._native.wf_post_factor(c.byref(self._body[body]), buffer.address)
 
+    def prepare_for_factors(self) -> None:
+        """Does nothing."""
+
+    def expect_factors(self, body: int, pattern: FactorPattern) -> None:
+        """Does nothing: a factor is applied as it comes."""
+
     def resume_factor(self, body: int, pattern: FactorPattern, values: NDArray[Any], step: int) -> None:
         """Posts the factor that was in use when the state was saved; what is known of its correction holds."""
         self.post_factor(body, pattern, values, step)
