@@ -18,7 +18,8 @@ yaml = pytest.importorskip("yaml")
 ROOT = Path(__file__).parents[1]
 DEPLOY = ROOT / "deploy"
 OPTIONS = {
-    program.split()[0]: {option for p in command.params for option in p.opts} for program, command in PROGRAMS.items()
+    program: {option for p in PROGRAMS[heading].params for option in p.opts}
+    for program, heading in (("sim-server", "sim-server SCENE.toml"), ("precond-worker", "precond-worker"))
 }
 
 
