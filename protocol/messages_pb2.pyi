@@ -236,7 +236,7 @@ class Factor(_message.Message):
     def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., step: _Optional[int] = ..., warp: _Optional[bool] = ..., pattern: _Optional[int] = ..., dtype: _Optional[str] = ..., nonzeros: _Optional[int] = ..., checksum: _Optional[int] = ..., slot: _Optional[_Union[Slot, _Mapping]] = ..., worker: _Optional[str] = ..., seconds: _Optional[float] = ..., failure: _Optional[str] = ..., job: _Optional[int] = ..., matrix_shared: _Optional[bool] = ..., remedy: _Optional[str] = ...) -> None: ...
 
 class WorkerInfo(_message.Message):
-    __slots__ = ("header", "worker", "pid", "host", "library", "threads", "shared_memory", "jobs", "failures", "superseded", "refused", "bulk_shared", "bulk_copied", "builds", "idle")
+    __slots__ = ("header", "worker", "pid", "host", "library", "threads", "shared_memory", "jobs", "failures", "superseded", "refused", "bulk_shared", "bulk_copied", "builds", "idle", "share", "leaving")
     HEADER_FIELD_NUMBER: _ClassVar[int]
     WORKER_FIELD_NUMBER: _ClassVar[int]
     PID_FIELD_NUMBER: _ClassVar[int]
@@ -252,6 +252,8 @@ class WorkerInfo(_message.Message):
     BULK_COPIED_FIELD_NUMBER: _ClassVar[int]
     BUILDS_FIELD_NUMBER: _ClassVar[int]
     IDLE_FIELD_NUMBER: _ClassVar[int]
+    SHARE_FIELD_NUMBER: _ClassVar[int]
+    LEAVING_FIELD_NUMBER: _ClassVar[int]
     header: Header
     worker: str
     pid: int
@@ -267,7 +269,19 @@ class WorkerInfo(_message.Message):
     bulk_copied: int
     builds: bool
     idle: bool
-    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., worker: _Optional[str] = ..., pid: _Optional[int] = ..., host: _Optional[str] = ..., library: _Optional[str] = ..., threads: _Optional[int] = ..., shared_memory: _Optional[bool] = ..., jobs: _Optional[int] = ..., failures: _Optional[int] = ..., superseded: _Optional[int] = ..., refused: _Optional[int] = ..., bulk_shared: _Optional[int] = ..., bulk_copied: _Optional[int] = ..., builds: _Optional[bool] = ..., idle: _Optional[bool] = ...) -> None: ...
+    share: float
+    leaving: bool
+    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., worker: _Optional[str] = ..., pid: _Optional[int] = ..., host: _Optional[str] = ..., library: _Optional[str] = ..., threads: _Optional[int] = ..., shared_memory: _Optional[bool] = ..., jobs: _Optional[int] = ..., failures: _Optional[int] = ..., superseded: _Optional[int] = ..., refused: _Optional[int] = ..., bulk_shared: _Optional[int] = ..., bulk_copied: _Optional[int] = ..., builds: _Optional[bool] = ..., idle: _Optional[bool] = ..., share: _Optional[float] = ..., leaving: _Optional[bool] = ...) -> None: ...
+
+class Need(_message.Message):
+    __slots__ = ("header", "lost", "workers")
+    HEADER_FIELD_NUMBER: _ClassVar[int]
+    LOST_FIELD_NUMBER: _ClassVar[int]
+    WORKERS_FIELD_NUMBER: _ClassVar[int]
+    header: Header
+    lost: float
+    workers: float
+    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., lost: _Optional[float] = ..., workers: _Optional[float] = ...) -> None: ...
 
 class Echo(_message.Message):
     __slots__ = ("header", "slot", "nonce", "settled")
@@ -634,7 +648,7 @@ class Command(_message.Message):
     def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., client: _Optional[str] = ..., verb: _Optional[str] = ..., interaction: _Optional[_Union[Interaction, _Mapping]] = ..., secret: _Optional[bytes] = ..., target: _Optional[_Union[ObstacleTarget, _Mapping]] = ..., parameters: _Optional[_Iterable[_Union[Parameter, _Mapping]]] = ..., object: _Optional[str] = ..., steps: _Optional[int] = ..., worker: _Optional[str] = ..., cut: _Optional[_Union[Cut, _Mapping]] = ...) -> None: ...
 
 class Reply(_message.Message):
-    __slots__ = ("header", "error", "interaction", "status", "unchanged", "parameters", "worker", "removed", "left", "opened", "copied")
+    __slots__ = ("header", "error", "interaction", "status", "unchanged", "parameters", "worker", "removed", "left", "opened", "copied", "role", "verbs")
     HEADER_FIELD_NUMBER: _ClassVar[int]
     ERROR_FIELD_NUMBER: _ClassVar[int]
     INTERACTION_FIELD_NUMBER: _ClassVar[int]
@@ -646,6 +660,8 @@ class Reply(_message.Message):
     LEFT_FIELD_NUMBER: _ClassVar[int]
     OPENED_FIELD_NUMBER: _ClassVar[int]
     COPIED_FIELD_NUMBER: _ClassVar[int]
+    ROLE_FIELD_NUMBER: _ClassVar[int]
+    VERBS_FIELD_NUMBER: _ClassVar[int]
     header: Header
     error: str
     interaction: Interaction
@@ -657,7 +673,9 @@ class Reply(_message.Message):
     left: int
     opened: int
     copied: int
-    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., error: _Optional[str] = ..., interaction: _Optional[_Union[Interaction, _Mapping]] = ..., status: _Optional[_Union[Status, _Mapping]] = ..., unchanged: _Optional[bool] = ..., parameters: _Optional[_Iterable[_Union[LiveParameter, _Mapping]]] = ..., worker: _Optional[str] = ..., removed: _Optional[int] = ..., left: _Optional[int] = ..., opened: _Optional[int] = ..., copied: _Optional[int] = ...) -> None: ...
+    role: str
+    verbs: _containers.RepeatedScalarFieldContainer[str]
+    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., error: _Optional[str] = ..., interaction: _Optional[_Union[Interaction, _Mapping]] = ..., status: _Optional[_Union[Status, _Mapping]] = ..., unchanged: _Optional[bool] = ..., parameters: _Optional[_Iterable[_Union[LiveParameter, _Mapping]]] = ..., worker: _Optional[str] = ..., removed: _Optional[int] = ..., left: _Optional[int] = ..., opened: _Optional[int] = ..., copied: _Optional[int] = ..., role: _Optional[str] = ..., verbs: _Optional[_Iterable[str]] = ...) -> None: ...
 
 class Parameter(_message.Message):
     __slots__ = ("key", "value")
