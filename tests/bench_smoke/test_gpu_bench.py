@@ -159,7 +159,7 @@ def test_pieces_become_one_page(found: tuple[Beams, Any], tmp_path: Path) -> Non
     assert lines and lines[0][2:4] == ["22.5", "0.5"] and "321" in lines[0]  # ours, over the aim of 45; direct
     assert "| 512 beams of 540 | 500 | 1000 | 2 |" in text and "5.12e+05" not in text and "| 512000 |" in text
     assert text.count("| 540 tets |") == 1 and "| solver.threads=2 | 11.5 |" in text
-    assert "pieces = 2" in text and "commit b" in text and "| 2026-01-01 | a | steps |" in text
+    assert "pieces = 2" in text and "commit b" in text and "| 2026-01-01 | a | none | steps |" in text
     assert "| cpu | 77 | 12 |" in text
     beside = table_under(text, "Several linearizations")
     assert [row["of one"] for row in beside if row["needed"] == "2"] == ["1.25"]

@@ -142,7 +142,11 @@ def merge(files: list[Path], out: Path | None) -> None:
     if several:
         report.say("Put together of several runs, the last one described above:")
         report.table(
-            [{**{k: part["header"][k] for k in ("date", "commit")}, **_words(part["arguments"])} for part in parts]
+            [
+                {**{k: part["header"][k] for k in ("date", "commit")}, "gpu": part["data"]["device"]["gpu"]}
+                | _words(part["arguments"])
+                for part in parts
+            ]
         )
     page.write(report, page.merged([part["data"] for part in parts]))
 
