@@ -303,7 +303,10 @@ def _set_up(closing: ExitStack, o: Options) -> "tuple[Service, Supervisor | None
     supervisor = None
     if o.workers and not simulation.scene.integrator.explicit:  # which needs none
         endpoint = on_this_machine((o.listen or [DEFAULT_ENDPOINT])[0])
-        supervisor = Supervisor(o.workers, o.name, [endpoint], ["--device", o.worker_device])
+        options = ["--device", o.worker_device]
+        if not link.shared_memory:  # which was told, once
+            options.append("--no-shared-memory")
+        supervisor = Supervisor(o.workers, o.name, [endpoint], options)
         closing.callback(supervisor.close)
         service.supervise(supervisor)
     if page is not None:
