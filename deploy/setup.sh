@@ -111,6 +111,15 @@ apt_get() {
         apt-get -q -y -o Dpkg::Use-Pty=0 -o DPkg::Lock::Timeout=300 "$@"
 }
 
+# Asks who sits at a terminal; CI and scripts have said yes by running this.
+may_install() {
+    local answer=
+    { [ -t 0 ] && [ -t 2 ] && [ -z "${CI:-}" ]; } || return 0
+    printf 'deploy/run: install them (apt-get)? [Y/n] ' >&2
+    read -r answer || true
+    [[ "$answer" =~ ^([yY].*)?$ ]]
+}
+
 install_system_packages() {
     local missing=() words log
     mapfile -t missing < <(missing_packages "$@")
@@ -119,7 +128,8 @@ install_system_packages() {
     if ! have apt-get; then
         say "this is not Debian or Ubuntu; wanted, under its Debian names: ${missing[*]}"
     elif may_be_root; then
-        say "needs system packages: ${missing[*]}"
+        say "needs system packages, for the whole machine: ${missing[*]}"
+        may_install || { say "nothing is installed; going on without: $words"; return 0; }
         log=$(mktemp)
         [ "$(id -u)" -eq 0 ] || sudo -v || true  # asks for a password here, where nothing is written over it
         if ! { shown "reading lists of packages (apt-get)" "$log" apt_get update &&
@@ -172,14 +182,30 @@ fingerprint() {
         echo "$root" "$1"
         "${PYTHON:-python3}" -c 'import sys; print(sys.version, sys.base_prefix)'
         have_suitesparse && have_python_headers && echo cholmod
-        cat "$root/pyproject.toml" "$root/deploy/constraints.txt" "$root/deploy/setup.sh"
+        cat "$root/pyproject.toml" "$root"/deploy/{constraints.txt,locked.py,setup.sh}
     } | sha256sum
 }
 
+# Nothing is resolved, and nothing is built in an environment that pip would fill with what it finds newest.
 pip_install() {
     # PIP_USER: a user = true in somebody's pip.conf would contradict the virtual environment.
     PIP_USER=0 PIP_ROOT_USER_ACTION=ignore "$venv/bin/python" -m pip --disable-pip-version-check --no-color \
-        install --progress-bar off -c "$root/deploy/constraints.txt" "$@"
+        install --progress-bar off --no-deps --no-build-isolation "$@"
+}
+
+# install_locked EXTRA...: what these extras need, in the versions and with the hashes of constraints.txt.
+install_locked() {
+    local list code=0
+    list=$(mktemp)
+    "$venv/bin/python" "$root/deploy/locked.py" "$@" >"$list" && pip_install --require-hashes -r "$list" || code=$?
+    rm -f "$list"
+    return $code
+}
+
+# install_extras EXTRA,...: the same, and the project itself, to be edited.
+install_extras() {
+    # shellcheck disable=SC2086  # names of extras
+    install_locked build && install_locked ${1//,/ } && pip_install --no-index -e "$root"
 }
 
 make_venv() {
@@ -194,13 +220,10 @@ make_venv() {
     rm -f "$log"
 }
 
-build_cholmod() { pip_install setuptools cython && pip_install --no-build-isolation scikit-sparse; }
-
 install_cholmod() {
     have_suitesparse && have_python_headers || return 0
     have_sksparse && return
-    # Not isolated: built with the setuptools, Cython and NumPy of constraints.txt, today and in a year.
-    shown "building scikit-sparse, for CHOLMOD (pip)" "$venv/setup.log" build_cholmod ||
+    shown "building scikit-sparse, for CHOLMOD (pip)" "$venv/setup.log" install_locked cholmod ||
         say "scikit-sparse could not be built; $venv/setup.log says why"
 }
 
@@ -212,7 +235,7 @@ install_python_packages() {
     if [ "$(cat "$stamp" 2>/dev/null)" != "$now" ] || ! [ -x "$venv/bin/python" ]; then
         make_venv
         : >"$venv/setup.log"
-        if ! shown "installing Python packages (pip)" "$venv/setup.log" pip_install -e "${root}[$extras]"; then
+        if ! shown "installing Python packages (pip)" "$venv/setup.log" install_extras "$extras"; then
             tail -n 20 "$venv/setup.log" >&2
             stop 1 "pip failed; $venv/setup.log has all of it"
         fi

@@ -148,9 +148,11 @@ def _serve(
     from protocol.counters import Counters
     from protocol.network.metrics_server import MetricsServer, metrics_address
     from protocol.network.session import Session
+    from protocol.process.notify import Notifier
     from protocol.refused import Refused
 
     end_in_order()
+    notifier = Notifier.of_environment()
     try:
         check_name(name, "--name")
         where = server_addresses(servers, connect)
@@ -191,8 +193,19 @@ def _serve(
         observe = (lambda seconds: None) if collected is None else collected.factorization.observe
         return Worker(connected, partial(make_factorization, library=library), on_server, observe)
 
-    with closing, MainLoop(where, shared_memory, connection, worker) as serving:
-        serving.run()
+    def left(connected: ServerConnection) -> None:
+        print(f"precond-worker {name}: leaves server {connected.server}, others need it more", flush=True)
+        if collected is not None:
+            collected.connections.remove(connected)
+
+    with closing, MainLoop(
+        where, shared_memory, connection, worker, name, left, notifier.alive
+    ) as serving:  # fmt: skip
+        notifier.ready(f"{shown}, looking for {', '.join(servers)}")
+        try:
+            serving.run()
+        finally:
+            notifier.stopping()
 
 
 def library_title(library: str) -> str:

@@ -23,6 +23,10 @@ class RoundRobin:
         self.workers.append(worker)
         self.wake.set()
 
+    def remove(self, worker: Worker) -> None:
+        """Removes a server."""
+        self.workers.remove(worker)
+
     def step(self, timeout: float) -> None:
         """Takes in what was received, waiting up to `timeout` seconds for it, and does one job."""
         if not any(worker.waiting for worker in self.workers):

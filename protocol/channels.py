@@ -41,6 +41,7 @@ CHANNELS: dict[str, Channel] = {
     "pattern": Channel("pattern/{object}", "FactorPattern", "worker", "when it is new", 256 * MIB, 0, "pattern of L"),
     "factor": Channel("factor/{object}", "Factor", "worker", "one per matrix", 64 * KIB, GIB, "values of L"),
     "worker": Channel("worker/{worker}", "WorkerInfo", "worker", "5 Hz", 16 * KIB, 0, "hello, then heartbeat"),
+    "need": Channel("need", "Need", "server", "2 Hz", KIB, 0, "what more workers are worth to it"),
     "echo": Channel("echo/{worker}", "Echo", "worker", "query, at join", 4 * KIB, 0, "does shared memory work?"),
     "steps": Channel("steps", "Steps", "server", "20 Hz batches", 8 * MIB, 0, "iterations, residuals, times"),
     "reactions": Channel(

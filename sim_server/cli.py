@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from protocol.process.command_line import Program, Terminated, end_in_order
+from protocol.process.notify import Notifier
 from protocol.process.nvidia import nvidia_device
 from sim_server.errors import DeviceError, DeviceLost, InputError, NameTaken
 from sim_server.service.compile_notice import compile_notices
@@ -124,6 +125,10 @@ def serve(
         str | None,
         typer.Option(metavar="HOST:PORT", help="Serve metrics for Prometheus; PORT alone: of this machine"),
     ] = None,
+    max_objects: Annotated[int | None, typer.Option(metavar="N", min=1, help="Refuse scenes with more objects")] = None,
+    max_memory: Annotated[
+        str | None, typer.Option(metavar="SIZE", help="Refuse scenes that need more, by an estimate, as 4GB")
+    ] = None,
     name: Annotated[str, typer.Option(metavar="NAME", help="Name of this server in all keys")] = "sim",
     no_shared_memory: Annotated[bool, typer.Option("--no-shared-memory", help="Send arrays as bytes")] = False,
     quiet: Annotated[bool, typer.Option("--quiet", help="Say nothing but errors")] = False,
@@ -158,10 +163,12 @@ def serve(
         return
     service: Service | None = None
     code = 0
+    notifier = Notifier.of_environment()
     try:
         options = Options(
             scene, set_ or [], choose_device(device, say), name, listen, connect, not no_shared_memory, record, steps,
             realtime, workers, worker_device, web, quiet, resume, metrics, record_rotate or [], record_keep,
+            max_objects, max_memory,
         )  # fmt: skip
         with ExitStack() as closing:
             with nullcontext() if quiet else compile_notices(say):
@@ -170,9 +177,12 @@ def serve(
             _announce(say, service, scene, listen)
             _wait_for_workers(service, supervisor)
             _describe_objects(say, service, listen)
+            service.health.notifier = notifier
+            notifier.ready(f"{scene.name} on {', '.join(listen or ['loopback'])}")
             try:
                 service.run()
             finally:
+                notifier.stopping()
                 say(_summary(service))
     except NameTaken as error:
         PROGRAM.bad_input(str(error))
@@ -248,6 +258,8 @@ class Options:
     metrics: str | None
     record_rotate: list[str]
     record_keep: str | None
+    max_objects: int | None
+    max_memory: str | None
 
 
 def _set_up(closing: ExitStack, o: Options) -> "tuple[Service, Supervisor | None]":
@@ -263,6 +275,7 @@ def _set_up(closing: ExitStack, o: Options) -> "tuple[Service, Supervisor | None
     from sim_server.network.link import ServerLink
     from sim_server.recording.recorder import Recorder
     from sim_server.recording.rotation import Rotation
+    from sim_server.scene.size_limits import SizeLimits
     from sim_server.service.service import Service
     from sim_server.service.supervisor import Supervisor
     from sim_server.service.web_page import WebPage
@@ -276,7 +289,8 @@ def _set_up(closing: ExitStack, o: Options) -> "tuple[Service, Supervisor | None
             raise InputError("--record-rotate and --record-keep go with --record")
         metrics = None if o.metrics is None else metrics_address(o.metrics)
         checkpoint = None if o.resume is None else read(o.resume)
-        simulation = Simulation.load(o.scene, o.overrides, o.device)
+        limits = SizeLimits.of_options(o.max_objects, o.max_memory)
+        simulation = Simulation.load(o.scene, o.overrides, o.device, limits)
         link = closing.enter_context(ServerLink(o.name, o.listen, o.connect, shared_memory=o.shared_memory))
         recorder = None
         if o.record is not None:
@@ -323,7 +337,7 @@ def _serve_metrics(closing: ExitStack, service: "Service", host: str, port: int)
     from sim_server.service.metrics import ServerMetrics
 
     names = [body.name for body in service.simulation.world.bodies]
-    found = ServerMetrics(names, service.link, service.recorder)
+    found = ServerMetrics(names, service.link, service.recorder, lambda: service.need.lost)
     closing.enter_context(MetricsServer(host, port, found, service.health.why_not))
     service.telemetry.metrics = found
     service.telemetry.publish_status("running")

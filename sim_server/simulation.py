@@ -40,6 +40,7 @@ from sim_server.mechanics.ties import make_ties, ties_alone
 from sim_server.mechanics.world import Body, World
 from sim_server.parameters import LiveParameters
 from sim_server.scene import Scene, load
+from sim_server.scene.size_limits import NO_LIMITS, SizeLimits
 
 if TYPE_CHECKING:
     from scipy.sparse import csc_array
@@ -171,10 +172,13 @@ class Simulation:
         return found[0] if found else None
 
     @classmethod
-    def load(cls, path: str | Path, overrides: Sequence[str] = (), device: str = "cpu") -> "Simulation":
-        """From a scene file."""
+    def load(
+        cls, path: str | Path, overrides: Sequence[str] = (), device: str = "cpu", limits: SizeLimits = NO_LIMITS
+    ) -> "Simulation":
+        """From a scene file. Raises InputError, also for one beyond the limits."""
         scene = load(path, overrides)
         try:
+            limits.check(scene)
             return cls(scene, device)
         except DeviceError:
             raise

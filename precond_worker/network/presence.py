@@ -5,6 +5,7 @@ Anybody on the network may declare the token of a server, so that a new token on
 incarnation that it serves when the token of that one is gone, or when it answers no more and another one does.
 """
 
+import contextlib
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -62,6 +63,11 @@ class Presence:
         self._tokens = self._session.liveliness().declare_subscriber(
             key("alive_server", self._server), self._token, history=True
         )
+
+    def end(self) -> None:
+        """Hears no more tokens."""
+        with contextlib.suppress(zenoh.ZError):
+            self._tokens.undeclare()
 
     def _token(self, sample: zenoh.Sample) -> None:
         try:

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: MIT
 """The connection of a worker to one server: receives matrices, sends patterns and factors, says hello."""
 
+import contextlib
 import os
 import socket
 import threading
@@ -49,6 +50,8 @@ class ServerConnection:
         self.slots = SlotMap()
         self.incarnation = 0  # of the server that is served; 0: none
         self.shared_memory = False
+        self.share = 1.0  # part of this process's time for the server
+        self.leaving: float | None = None  # since when it takes no more jobs [s, monotonic]
         self._session, self._threads, self._can_assemble = session, threads, can_assemble()
         self._sequence: Counter[str] = Counter()
         self._saying = threading.Lock()
@@ -143,6 +146,8 @@ class ServerConnection:
                 bulk_copied=self.counters.bulk_copied,
                 builds=self._can_assemble,
                 idle=self.received.idle,
+                share=self.share,
+                leaving=self.leaving is not None,
             )
             self._session.zenoh.put(key("worker", self.server, worker=self.name), info.SerializeToString())
 
@@ -187,6 +192,25 @@ class ServerConnection:
         """Sends a factor or a failure; values: of the factor if they are in no slot."""
         name = key("factor", self.server, object=message.header.object)
         self._session.zenoh.put(name, values, attachment=message.SerializeToString(), congestion_control=BLOCK)
+
+    def leave(self) -> None:
+        """Has the server send no more jobs; one under way may still be answered."""
+        if self.leaving is None:
+            self.leaving = time.monotonic()
+            self._heartbeat.wake()
+
+    def stay(self) -> None:
+        """Takes jobs again after `leave`."""
+        self.leaving = None
+        self._heartbeat.wake()
+
+    def withdraw(self) -> None:
+        """Closes, and takes back what it has declared, where the session goes on without it."""
+        self.close()
+        self._presence.end()
+        for declared in (self._token, self._matrices, self._others):
+            with contextlib.suppress(zenoh.ZError):
+                declared.undeclare()
 
     def close(self) -> None:
         """Ends the heartbeat; the session is closed by its owner."""

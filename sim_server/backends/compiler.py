@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from sim_server.backends.build_pool import CompileError, Job, compilers
+from sim_server.backends.cache_trust import distrust
 from sim_server.backends.processor_variants import LIBRARIES, made_by, variant
 
 SOURCES = Path(__file__).parents[1]  # sim_server/
@@ -78,7 +79,7 @@ def cache_folder() -> Path:
 
 def _make(folder: Path) -> None:
     try:
-        folder.mkdir(parents=True, exist_ok=True)
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
     except OSError as error:
         raise CompileError(
             f"compiled kernels cannot be kept in {folder}: {error.strerror}; WARPFACTOR_CACHE may name another folder"
@@ -147,14 +148,19 @@ def _brought(source: Path, defines: tuple[str, ...], text: str | None) -> Path |
 def begin(source: Path, defines: tuple[str, ...] = (), text: str | None = None) -> Path:
     """The shared library of one text, which exists after `compilers.finish`; compiles only what is not there.
 
-    text: where the file does not hold it. Raises CompileError without a compiler or a folder for the library.
+    text: where the file does not hold it. Raises CompileError without a compiler or a folder for the library, or
+    if others than this user could have put it there.
     """
     if (brought := _brought(source, defines, text)) is not None:
         return brought
     flags = [*FLAGS, *(f"-D{d}" for d in defines)]
     library = cache_folder() / f"{source.stem}-{digest(source, flags, text, _machine())}.so"
-    if not library.exists():
+    there = library.exists()
+    if not there:
         _make(library.parent)
+    if why := distrust(library):
+        raise CompileError(f"compiled kernels are not loaded: {why}")
+    if not there:
         compilers.begin(job(source, flags, text, library))
     return library
 

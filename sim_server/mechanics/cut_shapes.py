@@ -16,14 +16,15 @@ def met_by_blade(x: Float64, tets: Int32, corners: Float64) -> Int64:
 
     x (n, 3), tets (m, 4): nodes [m] and elements. corners (3, 3) or (4, 3): of a triangle, or of a quadrangle as two
     """
-    points = x[tets]
     low, high = corners.min(axis=0), corners.max(axis=0)
-    near = np.flatnonzero(((points.max(axis=1) >= low) & (points.min(axis=1) <= high)).all(axis=1))
+    beyond = np.concatenate([x < low, x > high], axis=1) @ np.array([1, 2, 4, 8, 16, 32], np.uint8)
+    near = np.flatnonzero(np.bitwise_and.reduce(beyond[tets], axis=1) == 0)  # not all four beyond one side of its box
+    points = x[tets[near]]
     triangles = [corners[[0, 1, 2]], *([corners[[0, 2, 3]]] if len(corners) == 4 else [])]
     met = np.zeros(len(near), bool)
     for triangle in triangles:
-        across = np.flatnonzero(_across(points[near], triangle))
-        met[across] |= _meet(points[near[across]], triangle)
+        across = np.flatnonzero(_across(points, triangle))
+        met[across] |= _meet(points[across], triangle)
     return near[met]
 
 
@@ -35,8 +36,9 @@ def opened_by_blade(x: Float64, tets: Int32, owners: Int64, corners: Float64) ->
     """
     met = np.zeros(len(tets) + 1, bool)
     met[met_by_blade(x, tets, corners)] = True
-    side, a, b = _sides(x[tets].mean(axis=1), corners), owners[:, 0], owners[:, 1]
-    return np.flatnonzero((a >= 0) & (b >= 0) & (side[a] != side[b]) & (met[a] | met[b]))
+    faces = np.flatnonzero((owners >= 0).all(axis=1) & met[owners].any(axis=1))
+    side = _sides(x[tets[owners[faces]]].mean(axis=2).reshape(-1, 3), corners).reshape(-1, 2)
+    return np.asarray(faces[side[:, 0] != side[:, 1]])
 
 
 def border(chosen: Bools, owners: Int64) -> Int64:

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_server.arrays import Int32, Int64
+from sim_server.arrays import Int32, Int64, distinct
 from sim_server.errors import InputError
 from sim_server.mechanics.splitting import Splitting
 from sim_server.mechanics.world import World
@@ -133,7 +133,7 @@ class FollowedPattern:
             n, root = self._world.nodes, self._splitting.nodes(scene, "root")
             free = self._free[root]
             places = [places_of(self._splitting.elements(scene, e), self._world, free) for e in self._coupled]
-            keys = np.unique(np.concatenate([np.zeros(0, np.int64), *(k for place in places for k in place.keys)]))
+            keys = distinct(np.concatenate([np.zeros(0, np.int64), *(k for place in places for k in place.keys)]))
             row, column = (part.astype(np.int32) for part in np.divmod(keys, n))
             if len(row) > self.blocks:
                 raise InputError(

@@ -21,6 +21,7 @@ from protocol.messages_pb2 import (
     Checkpoint,
     Command,
     LocalWorker,
+    Need,
     Obstacle,
     ObstaclePose,
     Reply,
@@ -45,7 +46,7 @@ log = logging.getLogger(__name__)
 TOKENS = 4096  # liveliness tokens of clients that may wait to be read
 REPLIES = 1024  # replies to commands that may wait to be sent
 
-Stamped = Checkpoint | Obstacle | ObstaclePose | Scene | State | Status | Steps | Topology
+Stamped = Checkpoint | Need | Obstacle | ObstaclePose | Scene | State | Status | Steps | Topology
 """Messages with a header of the server."""
 
 
@@ -225,6 +226,11 @@ class ServerLink:
     def publish_pose(self, pose: ObstaclePose) -> None:
         """Sends where an obstacle is to subscribers; replaces a pose that still waits to be sent."""
         self._publishers.put("pose", pose, object=pose.header.object)
+
+    def publish_need(self, lost: float) -> None:
+        """Tells the workers of a pool what more of them are worth. lost: as of Need"""
+        workers = sum(info.share or 1.0 for info in self.dispatch.workers())
+        self._publishers.put("need", Need(lost=lost, workers=workers))
 
     def publish_status(self, status: Status) -> None:
         """Fills in workers, clients and counts, sends the status to its subscribers and sets the answer to queries."""

@@ -8,11 +8,11 @@ import zenoh
 
 from protocol.channels import key
 from protocol.counters import Counters
-from protocol.messages_pb2 import ObstaclePose, State, Status, Steps
+from protocol.messages_pb2 import Need, ObstaclePose, State, Status, Steps
 from sim_server.network.send_queue import SendQueue
 
 URGENT = ("reactions",)  # channels whose messages are sent at once, before others
-Published = ObstaclePose | State | Status | Steps
+Published = Need | ObstaclePose | State | Status | Steps
 
 
 class Publishers:

@@ -137,7 +137,11 @@ class WorkerRegistry:
 
     def _is_available(self, name: str, now: float, busy_until: Mapping[str, float]) -> bool:
         worker = self._workers[name]
-        return worker.token and now <= max(worker.seen + self._silence, busy_until.get(name, 0.0))
+        return (
+            worker.token
+            and not worker.info.leaving
+            and now <= max(worker.seen + self._silence, busy_until.get(name, 0.0))
+        )
 
     def idle_period(self, name: str) -> tuple[float, float] | None:
         """RegisteredWorker.idle of a worker."""

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import contextlib
-import re
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -12,11 +11,9 @@ from pathlib import Path
 
 from protocol.log_pieces import later_pieces
 from sim_server.errors import InputError
+from sim_server.scene.sizes import SIZES, TIMES, measure
 
-UNITS = {"B": 1, "KB": 10**3, "MB": 10**6, "GB": 10**9, "TB": 10**12, "KIB": 2**10, "MIB": 2**20, "GIB": 2**30}
-TIMES = {"S": 1.0, "MIN": 60.0, "H": 3600.0, "D": 86400.0}
 LEAST_BYTES, LEAST_SECONDS = 10**6, 1.0
-_VALUE = re.compile(r"(\d+(?:\.\d+)?)\s*([A-Za-z]+)")
 
 
 @dataclass(frozen=True)
@@ -32,7 +29,7 @@ class Rotation:
         """Reads --record-rotate (sizes and times, of each the least) and --record-keep. Raises InputError."""
         sizes, times = [], []
         for text in rotate:
-            size, time = _measure(text, UNITS), _measure(text, TIMES)
+            size, time = measure(text, SIZES), measure(text, TIMES)
             if size is not None and size >= LEAST_BYTES:
                 sizes.append(size)
             elif time is not None and time >= LEAST_SECONDS:
@@ -44,7 +41,7 @@ class Rotation:
                 )
         if keep is None:
             return cls(min(sizes, default=None), min(times, default=None))
-        kept = _measure(keep, UNITS)
+        kept = measure(keep, SIZES)
         if kept is None or kept < 2 * LEAST_BYTES:
             raise InputError(f"--record-keep {keep}: allowed is a size of at least 2MB, as 20GB")
         if not rotate:
@@ -54,12 +51,6 @@ class Rotation:
     def due(self, size: int, age: float) -> bool:
         """True if a file of this size and age is to be ended [bytes, s]."""
         return (self.bytes is not None and size >= self.bytes) or (self.seconds is not None and age >= self.seconds)
-
-
-def _measure(text: str, units: dict[str, int] | dict[str, float]) -> float | None:
-    match = _VALUE.fullmatch(text.strip())
-    factor = units.get(match[2].upper()) if match else None
-    return float(match[1]) * factor if match and factor is not None else None
 
 
 class Kept:

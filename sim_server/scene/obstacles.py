@@ -1,17 +1,17 @@
 # SPDX-License-Identifier: MIT
 """The [[obstacle]] tables of a scene, and what contact needs of the scene as a whole."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Annotated, Any, Literal, Protocol
 
-from pydantic import Field, model_validator
+from pydantic import BeforeValidator, Field, model_validator
 from pydantic_core import InitErrorDetails
 
 from sim_server.errors import InputError
 from sim_server.scene.integrator_options import IntegratorOptions
 from sim_server.scene.live import Live
 from sim_server.scene.motion import Moved
-from sim_server.scene.parameters import File, NotNegative, Positive, Sizes, complaint, nearest
+from sim_server.scene.parameters import File, NotNegative, Positive, Sizes, Vector, as_tuple, complaint, nearest
 from sim_server.scene.pose import Pose
 
 FRICTION = 0.5  # coefficient of a surface of which nothing is said
@@ -33,7 +33,20 @@ class Obstacle(Moved):
     friction: Annotated[NotNegative, Live(0, 1.5)] = Field(
         default=FRICTION, description="coefficient of its surface [-]"
     )
+    edge: Annotated[tuple[Vector, Vector], BeforeValidator(as_tuple)] | None = Field(
+        default=None, description="ends of a cutting edge in its frame [m], which removes elements that it sweeps"
+    )
     pose: Pose = Pose()
+
+    @model_validator(mode="after")
+    def _edge_that_moves(self) -> "Obstacle":
+        if self.edge is None:
+            return self
+        if self.keyframes is None and self.moved is None:
+            raise complaint('edge: an obstacle cuts as it moves; needed: keyframes or moved = "client"')
+        if self.edge[0] == self.edge[1]:
+            raise complaint("edge: its two ends are the same point")
+        return self
 
     @model_validator(mode="after")
     def _keys_of_its_shape(self) -> "Obstacle":
@@ -60,6 +73,9 @@ class HasName(Protocol):
 
     name: str
 
+    @property
+    def effects(self) -> Mapping[str, Any]: ...
+
 
 def contact_errors(
     contact: Any, objects: Sequence[HasName], obstacles: Sequence[Obstacle], integrator: IntegratorOptions
@@ -73,6 +89,8 @@ def contact_errors(
         if name in names or name in shapes[:index]:
             text = f"names must differ, also those of objects and obstacles; more than once: {name}"
             yield _error(text, "obstacle", index)
+        if obstacles[index].edge is not None and not any("cutting" in o.effects for o in objects):
+            yield _error("it has nothing to cut: no object lists cutting = true", "obstacle", index, "edge")
     if contact is None:
         if obstacles:
             yield _error("objects touch it by the effect contact: list contact = true under [effects]", "obstacle", 0)

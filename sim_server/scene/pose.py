@@ -4,8 +4,10 @@
 from collections.abc import Sequence
 from math import cos, radians, sin
 
+import numpy as np
 from pydantic import Field
 
+from sim_server.arrays import Float64
 from sim_server.scene.parameters import Parameters, Vector
 
 
@@ -22,3 +24,10 @@ def quaternion(rotate: Sequence[float]) -> tuple[float, float, float, float]:
     return (
         a * b * c + p * q * r, p * b * c - a * q * r, a * q * c + p * b * r, a * b * r - p * q * c,
     )  # fmt: skip
+
+
+def turned(points: Float64, rotation: Float64) -> Float64:
+    """Returns points (n, 3) turned by a unit quaternion w, x, y, z."""
+    w, axis = rotation[0], rotation[1:]
+    across = 2 * np.cross(axis, points)
+    return np.asarray(points + w * across + np.cross(axis, across))

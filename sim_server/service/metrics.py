@@ -33,9 +33,12 @@ Row = tuple[list[str], float]
 
 
 class ServerMetrics:
-    """A collector of prometheus_client. objects: names in the order of bodies"""
+    """A collector of prometheus_client. objects: names in the order of bodies; lost: returns NeedMeter.lost"""
 
-    def __init__(self, objects: list[str], link: ServerLink, recorder: Recorder | None):
+    def __init__(
+        self, objects: list[str], link: ServerLink, recorder: Recorder | None, lost: Callable[[], float] = lambda: 0.0
+    ):
+        self.lost = lost
         self._names = [name if i < MOST_OBJECTS else OTHERS for i, name in enumerate(objects)]
         self._link, self._recorder = link, recorder
         self.status = pb.Status()
@@ -123,6 +126,8 @@ class ServerMetrics:
     def _network(self) -> Iterator[Metric]:
         counts, refusals = self._link.counters.copy()
         status = self.status
+        need = "Time that solves lose to old or missing factors, in a second"
+        yield _gauge("warpfactor_need_seconds", need, [], [([], self.lost())])
         yield _gauge("warpfactor_workers", "Workers that may be given jobs", [], [([], len(status.workers))])
         yield _gauge("warpfactor_clients", "Clients that are connected", [], [([], len(status.clients))])
         yield _counter("warpfactor_jobs", "Matrices sent to workers", counts.get("jobs", 0))

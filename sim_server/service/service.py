@@ -33,9 +33,11 @@ from sim_server.network.link import ServerLink
 from sim_server.recording import messages
 from sim_server.recording.recorder import Recorder
 from sim_server.service.between_steps import BetweenSteps
+from sim_server.service.blades import Blades
 from sim_server.service.commands import Commands
 from sim_server.service.halts import Halts
 from sim_server.service.health import Health
+from sim_server.service.need import NeedMeter
 from sim_server.service.pace import LOOK_PERIOD, PaceMonitor
 from sim_server.service.tearing import Tearing
 from sim_server.service.telemetry import Telemetry
@@ -87,7 +89,7 @@ class Service:
         self._halts = Halts(self.commands)
         self._between = BetweenSteps(self.engine.loop)
         self._start = Start(simulation)
-        self._tearing = Tearing(simulation)
+        self._tearing, self._blades = Tearing(simulation), Blades(simulation)
         self._sets: deque[tuple[pb.Command, Callable[[pb.Reply], None]]] = deque()  # that set parameters
         self._status_due = self._workers_due = self._pace_due = self._set_due = 0.0
         self.check_workers: Callable[[], None] = lambda: None  # called every WORKERS_PERIOD
@@ -103,6 +105,7 @@ class Service:
         self._last = None if steps is None else self.engine.step + steps
         self.telemetry.open(resume)
         self.health = Health(Notifier())
+        self.need = NeedMeter(self.driver)
 
     def _first_factors(self, realtime: bool) -> FirstFactors | None:
         """Returns the first factors that the first step waits for; None: it goes without."""
@@ -172,6 +175,7 @@ class Service:
         self._carry_out()
         self._set_parameters()
         self._tearing.look()
+        self._blades.look()
         if self._between.may_run:
             self._drain()
             self._between.run()
@@ -182,6 +186,8 @@ class Service:
         self.commands.release_absent(set(self.link.clients()))
         self.health.look(self.engine.step, self.commands.engine_paused or self._first is not None)
         self.telemetry.publish_status(self._state(), force=False)
+        if self.need.look():
+            self.link.publish_need(self.need.lost)
 
     def _carry_out(self) -> None:
         """Carries out all commands that wait; answers them once the loop has what they change."""
@@ -278,6 +284,7 @@ class Service:
             self.simulation.touch.release_of(name, touching)
         now = [m.targets for m in self.simulation.movers]
         self._start.reset(name)
+        self._blades.restart()
         for mover, old, new in zip(self.simulation.movers, targets, now, strict=True):
             if moved := {k: pose for k, pose in new.items() if not np.array_equal(pose, old[k])}:
                 mover.restore(moved)
@@ -367,7 +374,8 @@ class Service:
         """Passes on new step records with what objects exerted on obstacles and others, readings, and new frames."""
         contact = self.telemetry.contact
         undone = [*contact.count_clipped(records), *contact.crowded_nodes(), *contact.broken_ties()]
-        for line in [*self.telemetry.count_unconverged(records), *self.telemetry.halved(records), *undone]:
+        told = [*self.telemetry.count_unconverged(records), *self.telemetry.halved(records)]
+        for line in [*told, *self.telemetry.many_substeps(), *undone]:
             log.warning("%s", line)
         for line in [*self.telemetry.count_runaways(records), *self.telemetry.not_finite(records)]:
             log.error("%s", line)

@@ -9,7 +9,7 @@ while decisions of kernels are those that a test gives in their place.
 import ctypes as c
 import re
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
@@ -19,6 +19,7 @@ import numpy as np
 
 from sim_server.backends.gpu import device
 from sim_server.backends.gpu import engine as gpu_engine
+from sim_server.backends.gpu.conditions import Loop
 from sim_server.backends.gpu.inverse.workspace import workspace
 from tests.backends.fake_cuda import FakeDevice
 from tests.backends.fake_graphs import Graphs, Work
@@ -95,10 +96,26 @@ class Device(FakeDevice):
     def repeat(self, flag: Array) -> AbstractContextManager[None]:
         return Stream.graphs.branch(flag, repeats=True)
 
+    def loop(self) -> Loop:
+        """The number by which kernels tell it is the address of its condition."""
+        condition = np.zeros(1, np.int32)
+        Stream.graphs.put(lambda: condition.fill(0))
+        return Loop(condition.ctypes.data, lambda: Stream.graphs.branch(condition, repeats=True))
 
-def end_search(arguments: Any) -> None:
+    def linked(self, text: str, name: str, options: Sequence[str]) -> Any:
+        return sys.modules["cupy"].RawModule(code=text, options=[*options, "-rdc=true"])
+
+
+def end_search(arguments: Any, loop: Any) -> None:
     """In place of `accept_trial` (newton.cu): no body needs another trial."""
     c.c_int32.from_address(int(arguments["active"])).value = 0
+    if loop:
+        go_on(loop, False)
+
+
+def go_on(loop: Any, more: bool) -> None:
+    """Tells a loop whether it goes on."""
+    c.c_int32.from_address(int(loop)).value = more
 
 
 @contextmanager
@@ -119,7 +136,7 @@ def made(folder: Path, library: Any) -> ModuleType:
 
     calls: (kernel, number of arguments) of each launch
     ran: (kernel, text, grid, block, arguments) of each launch that was made, those of graphs when they ran
-    kernels: by name, what stands for a kernel and gets its arguments; others do nothing
+    kernels: by name, what stands for a kernel and gets its arguments; others do nothing. finish_step: of a step
     compiled: (text, options) of each module
     pending: arrays that were made since the host last waited for the current stream, and may not be there yet
     """
@@ -148,8 +165,9 @@ def made(folder: Path, library: Any) -> ModuleType:
 
         def run(self, grid: Any, block: Any, arguments: Any) -> None:
             cp.ran.append((self.kernel, self.text, grid, block, arguments))
-            if self.kernel in kernels:
-                kernels[self.kernel](*arguments)
+            name = "finish_step" if "finish_step" in self.text and self.kernel == "fused" else self.kernel
+            if name in kernels:
+                kernels[name](*arguments)
 
     class RawModule:
         def __init__(self, code: str, options: Any = (), backend: str = "", enable_cooperative_groups: bool = False):
@@ -182,7 +200,9 @@ def made(folder: Path, library: Any) -> ModuleType:
             getDeviceProperties=lambda number: properties, memcpyDeviceToDevice=3, memcpyHostToDevice=1,
             runtimeGetVersion=lambda: 13000, **memory,
         ),
-        Device=lambda *a: SimpleNamespace(id=0, compute_capability="90", attributes={"MultiProcessorCount": 132}),
+        Device=lambda *a: SimpleNamespace(
+            id=0, use=lambda: None, compute_capability="90", attributes={"MultiProcessorCount": 132}
+        ),
         Stream=Stream, get_current_stream=CurrentStream, memory=SimpleNamespace(OutOfMemoryError=MemoryError),
         alloc_pinned_memory=lambda size: np.zeros(max(size, 1), np.uint8),
         compiler=SimpleNamespace(CompileException=CompileException),

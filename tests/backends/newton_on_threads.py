@@ -18,6 +18,7 @@ from protocol.messages_pb2 import SolveStatus
 from sim_server.backends.compiler import INCLUDE, SOURCES, compiler
 from sim_server.backends.cpu.device import CpuLaunch
 from sim_server.backends.gpu import newton as gpu_newton
+from sim_server.backends.gpu.conditions import Loop
 from sim_server.backends.gpu.kernel_fusion import DOMAINS
 from sim_server.backends.gpu.newton import NewtonIteration, NewtonPhases
 from sim_server.backends.gpu.solver import PCG_BODY
@@ -33,14 +34,15 @@ SOLVE = 0  # phase
 TEXT = """
 #include "cuda_threads.h"
 #include "newton.cu"
-#define STEP(name, threads) \\
-    extern "C" void name##_all(const NewtonArguments* p, int grid, int block) { \\
+extern "C" void cudaGraphSetConditional(unsigned long long handle, unsigned value) { *(int*)handle = value; }
+#define STEP(name, threads, ...) \\
+    extern "C" void name##_all(const NewtonArguments* p, int grid, int block, unsigned long long loop) { \\
         if (block != threads) std::abort(); \\
-        launch(grid, threads, [&] { name(*p); }); \\
+        launch(grid, threads, [&] { name(*p __VA_OPT__(,) __VA_ARGS__); }); \\
     }
 STEP(begin_newton, BLOCK_NODES)
-STEP(update_state, ALL_LANES)
-STEP(accept_trial, BLOCK_NODES)
+STEP(update_state, ALL_LANES, loop)
+STEP(accept_trial, BLOCK_NODES, loop)
 STEP(end_newton, BLOCK_NODES)
 """
 
@@ -61,7 +63,7 @@ def compiled(folder: Path, *defined: str) -> c.CDLL:
     (folder / "newton.cpp").write_text(TEXT)
     (folder / "clock.cuh").write_text(CLOCK)
     paths = [f"-I{p}" for p in (folder, TESTS / "backends", SOURCES / "backends/gpu", INCLUDE)]
-    command = [compiler(), "-std=c++20", "-O1", "-shared", "-fPIC", "-Dreal=double", "-w", *paths]
+    command = [compiler(), "-std=c++20", "-O1", "-shared", "-fPIC", "-Dreal=double", "-DLOOPS", "-w", *paths]
     command += [f"-D{word}" for word in defined]
     subprocess.run([*command, str(folder / "newton.cpp"), "-o", str(folder / "newton.so")], check=True)
     return c.CDLL(str(folder / "newton.so"))
@@ -135,6 +137,7 @@ class OnThreads:
             counter, pool_counter = self.pcg.counter, own.pool_counter
         else:
             self.rows, self.results = np.zeros(bodies, PCG_BODY), np.zeros((1, bodies), PCG_RESULT)
+            self.rows["first"], self.rows["nodes"] = zip(*((b.first, b.last - b.first) for b in w.bodies), strict=True)
             rows, counter, pool_counter = self.rows.ctypes.data, zeros(1, np.int64), zeros(1, np.uint32)
         self.told = np.zeros((len(self.results), bodies), NEWTON_RESULT)
         self._solver: Any = SimpleNamespace(
@@ -145,7 +148,7 @@ class OnThreads:
         arrays = {"row_start": s.row_start, "columns": s.columns, "values": s.values, "b": s.b_material, "y": s.y}
         arrays |= {"x": w.x, "v": w.v}
         ranges = [(b.first, b.last) for b in w.bodies]
-        device: Any = SimpleNamespace(has_conditions=loops, repeat=lambda flag: self._graphs.branch(flag, repeats=True))
+        device: Any = SimpleNamespace(has_conditions=loops, loop=self._loop, linked=lambda *_: module)
         again: Any = [Launch(self, x) for x in self._assemble]
         self._iteration = NewtonIteration(
             self._gpu, device, newton, again, ranges, arrays, self.phases, self._solver, self.told
@@ -167,12 +170,18 @@ class OnThreads:
 
         self._graphs.put(run)
 
+    def _loop(self) -> Loop:
+        """The number by which kernels tell it is the address of its condition."""
+        condition = np.zeros(1, np.int32)
+        self._graphs.put(lambda: condition.fill(0))
+        return Loop(condition.ctypes.data, lambda: self._graphs.branch(condition, repeats=True))
+
     def _kernel(self, name: str) -> Any:
         function = getattr(self._library, f"{name}_all")
 
-        def launch(grid: tuple[int], block: tuple[int], arguments: tuple[NDArray[Any]]) -> None:
-            given = arguments[0].copy()
-            work = lambda: function(c.c_void_p(given.ctypes.data), grid[0], block[0])  # noqa: E731
+        def launch(grid: tuple[int], block: tuple[int], arguments: tuple[Any, ...]) -> None:
+            given, loop = arguments[0].copy(), c.c_uint64(int(arguments[1]) if len(arguments) > 1 else 0)
+            work = lambda: function(c.c_void_p(given.ctypes.data), grid[0], block[0], loop)  # noqa: E731
             self.put(name, work, guarded=name in ("update_state", "accept_trial"))
 
         return launch

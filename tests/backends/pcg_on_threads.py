@@ -200,7 +200,7 @@ class Solver:
         self.counter, contact = as_device(np.zeros(1, np.int64)), given.contact is not None
         self.solver = PcgSolver(
             gpu, given.ranges, given.arrays, self.counter, 4, contact=contact, correction=self.correction,
-            errors=given.errors or budgets, phases=phases, budgets=budgets,
+            errors=given.errors or budgets, phases=phases, budgets=budgets, cut=given.cut,
         )  # fmt: skip
         rows = self.solver.bodies
         assert rows["blocks"].sum() == blocks

@@ -39,16 +39,19 @@ def decide(cupy: ModuleType, needed: int) -> None:
     """Stands for the decisions of a step that needs so many trials."""
     left = [needed]
 
-    def accept_trial(arguments: Any) -> None:
+    def accept_trial(arguments: Any, loop: Any) -> None:
         left[0] -= 1
         if left[0] == 0:
-            fake_cupy.end_search(arguments)
+            fake_cupy.end_search(arguments, loop)
+        elif loop:
+            fake_cupy.go_on(loop, True)
 
-    def end_newton(arguments: Any) -> None:
-        c.c_int32.from_address(int(arguments["active"])).value = int(arguments["count"])
+    def finish_step(*arguments: Any) -> None:
+        ended = arguments[-1]
+        c.c_int32.from_address(int(ended["active"])).value = int(ended["count"])
         left[0] = needed
 
-    cupy.kernels.update(accept_trial=accept_trial, end_newton=end_newton)
+    cupy.kernels.update(accept_trial=accept_trial, finish_step=finish_step)
 
 
 def made(cupy: ModuleType, sim: Simulation) -> list[tuple[Any, ...]]:
@@ -78,7 +81,9 @@ def comparable(launches: list[tuple[Any, ...]]) -> list[tuple[Any, ...]]:
         found = argument.view(np.uint64) if argument.itemsize == 8 else argument
         return [known.setdefault(x, len(known)) if x >> 20 else x for x in found.ravel().tolist()]
 
-    return [(*launch[:4], [numbers(argument) for argument in launch[4]]) for launch in launches]
+    told = ("update_state", "accept_trial")  # whose last argument is the loop
+    given = [launch[4][:-1] if launch[0] in told else launch[4] for launch in launches]
+    return [(*launch[:4], [numbers(x) for x in kept]) for launch, kept in zip(launches, given, strict=True)]
 
 
 @pytest.mark.parametrize("scheme", ["backward_euler", "bdf2"])
@@ -90,11 +95,11 @@ def test_a_loop_makes_the_launches_of_the_unrolled_form_that_do_anything(cupy, m
         looped, unrolled = (made(cupy, sim) for sim in sims)
         names = [name(launch) for launch in looped]
         later = ["blocks", *TRIAL]
-        assert names == [*TRIAL, *later * (needed - 1), "end_newton", "end"], names
+        assert names == [*TRIAL, *later * (needed - 1), "end"], names
         others = [name(launch) for launch in unrolled]
-        assert others == [*TRIAL, *later * 8, "end_newton", "end"]
+        assert others == [*TRIAL, *later * 8, "end"]
         last = [k for k, found in enumerate(others) if found == "accept_trial"][needed - 1]
-        effective = unrolled[: last + 1] + unrolled[others.index("end_newton") :]
+        effective = unrolled[: last + 1] + unrolled[others.index("end") :]
         assert comparable(effective) == comparable(looped)
 
 
@@ -118,15 +123,18 @@ def test_later_linearizations_have_a_matrix_of_their_own(cupy, monkeypatch):
             assert f"phase[body[block * BLOCK_ITEMS + threadIdx.x]] {needed} return;" in launch[1]
 
 
-def test_the_search_begins_beside_the_first_blocks(cupy, monkeypatch):
+def test_the_search_begins_beside_the_first_blocks_and_ends_where_the_state_advances(cupy, monkeypatch):
     sim = simulation(monkeypatch, True, linearizations=3, scheme="bdf2")
     sim.engine.assemble()
     begins = [(name(x), x) for x in cupy.ran if x[0] == "fused" and "begin_beside(prologue" in x[1]]
     assert [domain for domain, _ in begins] == ["blocks"]
     cupy.ran.clear()
     sim.engine.solve()
-    ends = [x for x in cupy.ran if x[0] == "end_newton"]
-    assert begins[0][1][4][-1].tobytes() == ends[0][4][0].tobytes()  # with the same arguments
+    ends = [x for x in cupy.ran if name(x) == "end"]
+    assert begins[0][1][4][-1].tobytes() == ends[0][4][-1].tobytes()  # with the same arguments
+    lines = [line.strip() for line in ends[0][1].splitlines()]
+    items = lines.index("if (threadIdx.x < BLOCK_ITEMS && i < n) {")
+    assert lines.index("end_within(opened);") < items and lines[items + 1] == "end_item(opened, i);"
 
 
 def test_one_linearization_has_the_launches_of_a_solve_alone(cupy, monkeypatch):

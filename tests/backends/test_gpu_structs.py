@@ -11,6 +11,7 @@ import pytest
 from sim_server.backends.compiler import INCLUDE, SOURCES, compiler
 from sim_server.backends.declarations import Declarations
 from sim_server.backends.gpu import structs
+from sim_server.backends.gpu.conditions import LINKED
 from sim_server.backends.gpu.contact import TEXT as CONTACT_TEXT
 from sim_server.backends.gpu.device import PRECISIONS, own_headers
 from sim_server.backends.gpu.device import options as device_options
@@ -131,7 +132,7 @@ def test_the_condition_of_a_branch_compiles():
     """To PTX with a function that the driver has, as conditions.py compiles it."""
     if (library := nvrtc.library()) is None:
         pytest.skip("needs the package nvidia-cuda-nvrtc")
-    options = ["-arch=sm_80", "-rdc=true", "-std=c++17"]
+    options = ["-arch=sm_80", *LINKED[1:], "-std=c++17"]
     code, said = nvrtc.compiled(library, SOURCES / "backends/gpu/set_condition.cu", options)
     assert code and not said, said
 
@@ -148,6 +149,8 @@ def test_the_search_compiles_and_spills_no_registers(precision, arch):
         "--ptxas-options=-v",
         f"-arch={arch}",
     ]
+    if arch == "sm_80":  # that tells loops, as conditions.py compiles it
+        options += ["-DLOOPS", *LINKED[1:]]
     code, said = nvrtc.compiled(library, SOURCES / "backends/gpu/newton.cu", options)
     spilled = [int(n) for n in re.findall(r"(\d+) bytes (?:stack frame|spill stores|spill loads)", said)]
     assert code and len(spilled) >= 12 and max(spilled) == 0, said

@@ -5,12 +5,14 @@ import numpy as np
 import pytest
 
 from protocol import messages_pb2 as pb
+from sim_server.effects.cutting import Cutting
 from sim_server.errors import InputError
 from sim_server.scene.model import Scene
 from sim_server.simulation import Simulation
 from sim_server.state.start import Start
 from sim_server.updates.driver import Driver
 from tests.cutting.cut_scenes import HALVED, LAWS, cut, table
+from tests.scenes import factor_of
 
 pytestmark = pytest.mark.gpu
 NOTCH = "abs(X - 1) < 0.13 and Y > 0.25"
@@ -61,6 +63,27 @@ def test_solves_go_on_with_a_factor_from_before(precision):
     x = sim.fetch().x[gone].copy()
     driver.advance(5)
     np.testing.assert_allclose(sim.fetch().x[gone], x, atol=1e-5)
+
+
+def test_nodes_without_elements_are_set_apart_from_a_factor_from_before(monkeypatch):
+    found = {}
+    solver = {"update": "never", "tolerance": 1e-8, "preconditioner": "cholesky", "max_iterations": 3000}
+    for apart in (True, False):
+        if not apart:
+            monkeypatch.setattr(Cutting, "cut_input", lambda *_: None)
+        sim = made("corotational", "gpu", solver=solver)
+        sim.engine.run(2)
+        sim.engine.assemble()
+        factor = factor_of(sim, dtype=np.float32)
+        sim.engine.solve()
+        sim.engine.post_factor(0, *factor, 2)
+        sim.engine.settle_factors()
+        cut(sim, HALVED)
+        sim.engine.run(3)
+        records = sim.engine.records()[-3:]
+        assert (records["factor_step"] >= 0).all()
+        found[apart] = records["iterations"].max()
+    assert 2 * found[True] < found[False]
 
 
 def test_a_reset_makes_whole():

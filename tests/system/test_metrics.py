@@ -51,6 +51,7 @@ def test_a_scrape_counts_what_the_log_has(stage: Stage, tmp_path: Path) -> None:
     record = tmp_path / "run.mcap"
     server = stage.server(beam(tmp_path), "--record", str(record), "--metrics", str(at_server))
     with stage.client() as client:
+        until(lambda: scrape(at_server)["warpfactor_need_seconds", ()] > 0, "a need of factors, without a worker")
         stage.worker("w1", "--metrics", f"127.0.0.1:{at_worker}")
         until(lambda: fresh(client).objects[0].factors_used >= 5, "factors")
         client.push("beam", "tip", (0, 5, 0), duration=0.05)

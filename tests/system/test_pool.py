@@ -2,13 +2,17 @@
 """One pool of workers for several servers: found, shared in turn, over a router, whoever starts first."""
 
 import contextlib
+import json
+import time
 from collections.abc import Iterator
 
 import pytest
-from link_helpers import Driver, chain, free_endpoint, light_worker, process
+import zenoh
+from link_helpers import PATIENCE, ROOT, Driver, chain, free_endpoint, light_worker, matrix, process
 
 from protocol.network.session import open_session
 from sim_server.network.link import ServerLink
+from sim_server.updates.factor_source import Job
 
 pytestmark = pytest.mark.system
 
@@ -138,3 +142,63 @@ def test_a_faster_worker_gets_the_object_when_both_are_idle() -> None:
         for k in range(5):
             assert sim.factor(chain(5, "a"), 1000 + k).worker == "fast"
             sim.until(lambda: sim.link.dispatch.ready() == 2, "both to be idle")
+
+
+def test_workers_go_where_they_are_needed_most_and_lose_no_job() -> None:
+    router = free_endpoint()
+    demands = {"light": 1.0, "heavy": 2.2}
+    with contextlib.ExitStack() as stack:
+        stack.enter_context(open_session("server", listen=[router]))
+        names = [(name, free_endpoint()) for name in demands]
+        light, heavy = stack.enter_context(servers(*names, connect=[router]))
+        pair = {"light": (light, chain(5)), "heavy": (heavy, chain(6))}
+        for k in range(3):
+            stack.enter_context(worker("--connect", router, "--server", "*", name=f"w{k}"))
+        step = due = 0.0
+
+        def counts() -> dict[str, int]:
+            """Has both make jobs and tell their needs; returns how many workers each has."""
+            nonlocal step, due
+            step += 1
+            found = {name: len(driver.link.dispatch.workers()) for name, (driver, _) in pair.items()}
+            tells = time.monotonic() >= due
+            for name, (driver, topology) in pair.items():
+                driver.turn()
+                job = Job(topology.header.object, 1, int(step), True, matrix(topology), "float32")
+                if driver.link.dispatch.ready():
+                    driver.link.dispatch.submit(job)
+                if tells:
+                    driver.link.publish_need(demands[name] / max(found[name], 0.5))
+            due = time.monotonic() + 0.3 if tells else due
+            time.sleep(0.01)
+            return found
+
+        def until(wanted: dict[str, int]) -> None:
+            end = time.monotonic() + PATIENCE
+            while (found := counts()) != wanted:
+                assert time.monotonic() < end, found
+
+        until({"light": 1, "heavy": 2})
+        end = time.monotonic() + 4
+        while time.monotonic() < end:
+            assert counts() == {"light": 1, "heavy": 2}, "they stay"
+        demands["light"] = 12.0
+        until({"light": 2, "heavy": 1})
+        assert light.factors and heavy.factors
+        assert light.failures == heavy.failures == [], "who leaves answers its last job"
+        heavy.link.close()
+        del pair["heavy"]
+        until({"light": 3})
+
+
+def test_the_router_that_comes_along_is_one() -> None:
+    """deploy/zenoh/router.json5, at another endpoint: a server and a worker meet in it."""
+    config = zenoh.Config.from_file(str(ROOT / "deploy" / "zenoh" / "router.json5"))
+    router = free_endpoint()
+    config.insert_json5("listen/endpoints", json.dumps([router]))
+    with (
+        zenoh.open(config),
+        worker("--connect", router, "--server", "*"),
+        servers(("sim", free_endpoint()), connect=[router]) as (sim,),
+    ):
+        assert factors(sim, 5, 2) == {"shared"}

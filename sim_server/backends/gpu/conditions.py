@@ -8,14 +8,14 @@ Source: CUDA driver API, graph management (CUDA 12.4 and above).
 """
 
 import ctypes as c
-from collections.abc import Iterator
-from contextlib import contextmanager
-from typing import Any
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from sim_server.backends.compiler import SOURCES
-from sim_server.backends.gpu.cupy_types import DeviceArray, KernelFunction
+from sim_server.backends.gpu.cupy_types import DeviceArray, KernelFunction, KernelModule
 from sim_server.errors import DeviceError
 
 FUNCTIONS = (
@@ -23,6 +23,7 @@ FUNCTIONS = (
     "cuStreamUpdateCaptureDependencies", "cuStreamBeginCaptureToGraph", "cuStreamEndCapture",
 )  # fmt: skip
 IF, WHILE = 0, 1  # types of conditional nodes
+LINKED = ("-arch=compute_80", "-rdc=true", "-ftz=true")  # options of texts that the driver links; the last as CuPy
 CONDITIONAL_NODE, ASSIGN_DEFAULT, SET_DEPENDENCIES, RELAXED = 13, 1, 1, 2  # enumerators of the driver API
 
 
@@ -44,6 +45,16 @@ class GraphNodeParams(c.Structure):
     ]  # fmt: skip
 
 
+class Loop(NamedTuple):
+    """A loop of a graph, whose kernels tell it to go on by cudaGraphSetConditional(handle, 1).
+
+    It does not begin unless a kernel before it has said so in the same run of the graph. body: begins what it holds
+    """
+
+    handle: int
+    body: Callable[[], AbstractContextManager[None]]
+
+
 class Conditions:
     """Branches of the graphs that are captured from streams of one context.
 
@@ -55,7 +66,9 @@ class Conditions:
         missing = [name for name in FUNCTIONS if not hasattr(driver, name)]
         if missing:
             raise self._too_old(missing[0])
-        self._module, self._set_condition = self._compiled()
+        text = (SOURCES / "backends/gpu/set_condition.cu").read_text()
+        self._module = self.linked(text, "set_condition.cu", ["-std=c++17"])
+        self._set_condition: KernelFunction = self._module.get_function("set_condition")
 
     @staticmethod
     def _too_old(missing: str) -> DeviceError:
@@ -65,19 +78,19 @@ class Conditions:
             f"{missing}; CUDA 12.4 or above has it"
         )
 
-    def _compiled(self) -> tuple[Any, KernelFunction]:
-        """Compiles set_condition.cu to PTX, which the driver links with its own function."""
-        cp, name = self._cp, "set_condition.cu"
-        text = (SOURCES / "backends/gpu" / name).read_text()
+    def linked(self, text: str, name: str, options: Sequence[str]) -> KernelModule:
+        """Compiles a text to PTX, which the driver links with its own function cudaGraphSetConditional."""
+        cp = self._cp
         program = cp.cuda.nvrtc.createProgram(text, name, [], [])
-        cp.cuda.nvrtc.compileProgram(program, ["-arch=compute_80", "-rdc=true", "-std=c++17"])
-        module = cp.cuda.function.Module()
+        cp.cuda.nvrtc.compileProgram(program, [*LINKED, *options])
+        module: Any = cp.cuda.function.Module()
         try:
             module.load(cp.cuda.nvrtc.getPTX(program))
         except cp.cuda.driver.CUDADriverError as error:
             raise self._too_old(f"cudaGraphSetConditional ({error})") from error
         cp.cuda.nvrtc.destroyProgram(program)
-        return module, module.get_function("set_condition")
+        linked: KernelModule = module
+        return linked
 
     @contextmanager
     def branch(self, flag: DeviceArray, repeats: bool = False) -> Iterator[None]:
@@ -85,17 +98,35 @@ class Conditions:
 
         repeats: it runs again and again as long as the flag is not 0 at its end
         """
+        handle = self._handle()
+        arguments = np.uint64(handle), np.uint64(flag.data.ptr)
+        self._set_condition((1,), (1,), arguments)
+        with self._inside(handle, WHILE if repeats else IF):
+            yield
+            if repeats:
+                self._set_condition((1,), (1,), arguments)
+
+    def loop(self) -> Loop:
+        """Makes a loop of the graph that is captured from the current stream. What its body holds is told when it is
+        entered; kernels that tell it may be launched before."""
+        handle = self._handle()
+        return Loop(handle, lambda: self._inside(handle, WHILE))
+
+    def _handle(self) -> int:
+        """Returns a new handle of a condition, which is 0 when the graph that is captured begins to run."""
         graph, _, _ = self._capture()
         handle = c.c_uint64()
         self._call("cuGraphConditionalHandleCreate", c.byref(handle), graph, self._context, 0, ASSIGN_DEFAULT)
-        self._set_condition((1,), (1,), (np.uint64(handle.value), np.uint64(flag.data.ptr)))
-        body = self._add_node(handle.value, WHILE if repeats else IF)
+        return handle.value
+
+    @contextmanager
+    def _inside(self, handle: int, kind: int) -> Iterator[None]:
+        """What is launched inside is that of a conditional node of this kind."""
+        body = self._add_node(handle, kind)
         stream, ended = self._cp.cuda.Stream(non_blocking=True), c.c_void_p()
         self._call("cuStreamBeginCaptureToGraph", stream.ptr, body, None, None, 0, RELAXED)
         with stream:
             yield
-            if repeats:
-                self._set_condition((1,), (1,), (np.uint64(handle.value), np.uint64(flag.data.ptr)))
         self._call("cuStreamEndCapture", stream.ptr, c.byref(ended))
 
     def _add_node(self, handle: int, kind: int) -> c.c_void_p:

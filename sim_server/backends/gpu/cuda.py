@@ -2,6 +2,7 @@
 """The CUDA device as the native GPU loop uses it: memory, streams and context of CuPy, functions of the driver."""
 
 import ctypes as c
+from collections.abc import Sequence
 from contextlib import AbstractContextManager
 from functools import cached_property
 from typing import Any
@@ -10,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim_server.backends.gpu import structs
-from sim_server.backends.gpu.conditions import Conditions
-from sim_server.backends.gpu.cupy_types import DeviceArray, Event, Pointer, Stream
+from sim_server.backends.gpu.conditions import Conditions, Loop
+from sim_server.backends.gpu.cupy_types import DeviceArray, Event, KernelModule, Pointer, Stream
 from sim_server.errors import DeviceError
 
 FUNCTIONS = {
@@ -88,6 +89,14 @@ class CudaDevice:
     def repeat(self, flag: DeviceArray) -> AbstractContextManager[None]:
         """What is launched inside runs as long as `flag` (1,) is not 0, likewise."""
         return self._conditions.branch(flag, repeats=True)
+
+    def loop(self) -> Loop:
+        """Makes a loop of the graph that is captured now, see Conditions.loop. Raises DeviceError."""
+        return self._conditions.loop()
+
+    def linked(self, text: str, name: str, options: Sequence[str]) -> KernelModule:
+        """Compiles a text whose kernels tell loops. options: of the compiler. Raises DeviceError."""
+        return self._conditions.linked(text, name, options)
 
     def error(self, code: int) -> str:
         """Returns text and number of a driver error."""

@@ -133,7 +133,7 @@ class GpuEngine(DeviceLoop):
             phases.of_solves(errors) if phases else (), ATTEMPTS if stages else 0,
             given.contact is not None,
             given.contact is not None and bool(given.contact.surfaces or given.contact.ties), correction, errors,
-            budgets, most_blocks,
+            budgets, given.cut,
         )  # fmt: skip
         self._newton, newton_results = None, None
         if newton and phases:
@@ -141,7 +141,8 @@ class GpuEngine(DeviceLoop):
             parts = newton.parts[len(self._first) :]
             newton = Newton(newton.options, newton.dx_dv, parts, newton.detect, **newton.arrays)
             self._newton = NewtonIteration(
-                gpu, device, newton, assemble, ranges, arrays, phases, self.solver, newton_results, settled, search
+                gpu, device, newton, assemble, ranges, arrays, phases, self.solver, newton_results, settled, search,
+                within=given.held is None,
             )  # fmt: skip
         self._splits: DeviceSplits | None = None
         if most_blocks:
@@ -220,7 +221,8 @@ class GpuEngine(DeviceLoop):
             self._stamp_begin = self._stages.stamp_begin
         else:
             epilogue = Epilogue(EPILOGUE.checked(), "StepEpilogue", "finish_step", self._epilogue)
-            self._integrate = FusedKernel(integrate, epilogue)
+            ending = self._newton.ending() if self._newton else None
+            self._integrate = FusedKernel(integrate, epilogue, opening=ending)
             self._stamp_begin = self._integrate.function("stamp_begin")
         self._known: Float64 = arrays["values"]  # as a factor is to know them
         self._matrix = self._matrix_launches(assemble) if alone else ()
@@ -455,9 +457,23 @@ class GpuEngine(DeviceLoop):
         """Builds the inverse of a factor beside the steps; it is used from the first batch after its completion on."""
         self._factor_upload.post(body, pattern, values, step)
 
+    def prepare_for_factors(self) -> None:
+        """Has the kernels that build inverses of factors compiled beside the caller."""
+        self.solver.compile_builder()
+
+    def expect_factors(self, body: int, pattern: FactorPattern) -> None:
+        """Begins to plan the inverses of factors of a pattern that will come, beside the caller."""
+        self._factor_upload.expect(body, pattern)
+
     def resume_factor(self, body: int, pattern: FactorPattern, values: NDArray[Any], step: int) -> None:
         """Posts the factor that was in use when the state was saved."""
         self._factor_upload.post(body, pattern, values, step)
+
+    @property
+    def substeps(self) -> int:
+        """Explicit substeps of the first step; 0: an implicit scheme, or not known yet. Those of later ones are in the
+        records."""
+        return self._substeps.first if self._substeps else 0
 
     def settle_factors(self) -> None:
         """Blocks until the next solve will use the posted factors (deterministic policies)."""

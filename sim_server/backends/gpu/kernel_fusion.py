@@ -82,6 +82,20 @@ class Prologue(NamedTuple):
     blocks: int
 
 
+class Opening(NamedTuple):
+    """What a fused kernel does before its launches.
+
+    text: CUDA source. item: device function in it that is called with the struct and each item, before the launches do
+    theirs. whole: another one, called once by each thread block with the struct. params: values of the struct
+    """
+
+    text: str
+    struct: str
+    item: str
+    whole: str
+    params: NDArray[Any]
+
+
 class PhaseGuard(NamedTuple):
     """Device addresses of arrays that tell whether a later part of a step needs a launch (newton.cu, stages.cuh).
 
@@ -131,6 +145,7 @@ class FusedKernel:
     def __init__(
         self, launches: Sequence[DeviceLaunch], epilogue: Epilogue | None = None, private: frozenset[int] = frozenset(),
         guard: PhaseGuard | None = None, prologue: Prologue | None = None, exact: bool = False,
+        opening: Opening | None = None,
     ):  # fmt: skip
         self.name = "+".join(launch.name for launch in launches)
         self.items = next(launch.items for launch in launches if not launch.mailed)
@@ -138,8 +153,9 @@ class FusedKernel:
         self.shape = block_shape(launches[0].domain if sums else "elements", self.items, processors())
         self._launches = list(launches)  # keeps their arrays
         self._prologue_blocks = prologue.blocks if prologue else 0
-        text = FusedSource(launches, self.shape, epilogue, private, guard, prologue, exact)
-        self._arguments = (np.int32(self.items), *text.values, *(x.params for x in (epilogue, prologue) if x))
+        text = FusedSource(launches, self.shape, epilogue, private, guard, prologue, exact, opening)
+        parts: tuple[Epilogue | Prologue | Opening | None, ...] = (epilogue, prologue, opening)
+        self._arguments = (np.int32(self.items), *text.values, *(x.params for x in parts if x))
         folders = folder_options(*(launch.folder for launch in launches))
         flags = (*options(launches[0].types), *own_headers(), *folders)
         self._module = cupy().RawModule(code=text.source, options=flags, backend="nvrtc")
@@ -167,6 +183,7 @@ class FusedSource:
     guard: thread blocks return at once if they have no item of a body whose step is not made, unless there is an
         epilogue
     exact: other items of bodies whose step is made are left out, too; not for kernels whose threads write rows together
+    opening: writes arrays that the launches read
 
     source: the text
     values: of the arguments after the number of items
@@ -175,10 +192,10 @@ class FusedSource:
     def __init__(
         self, launches: Sequence[DeviceLaunch], shape: BlockShape, epilogue: Epilogue | None = None,
         private: frozenset[int] = frozenset(), guard: PhaseGuard | None = None, prologue: Prologue | None = None,
-        exact: bool = False,
+        exact: bool = False, opening: Opening | None = None,
     ):  # fmt: skip
-        self._launches, self._private, self._exact = launches, private, exact
-        self._restrict = "" if epilogue and epilogue.reads else "__restrict__ "
+        self._launches, self._private, self._exact, self._opening = launches, private, exact, opening
+        self._restrict = "" if opening or (epilogue and epilogue.reads) else "__restrict__ "
         self.values: list[np.number[Any]] = [np.uint64(address) for address in guard or ()]
         self._parameters = [f"const int* __restrict__ {name}" for name in guard._fields] if guard else []
         self._setup: list[str] = []
@@ -200,15 +217,19 @@ class FusedSource:
             lines.append(epilogue.text)
             self._parameters.append(f"const {epilogue.struct} epilogue")
             body_lines.append(f"{epilogue.function}(epilogue);")
-        opening = [f"const int block = (int)blockIdx.x - {prologue.blocks if prologue else 0};"]
+        begin = [f"const int block = (int)blockIdx.x - {prologue.blocks if prologue else 0};"]
         if prologue:
             lines.append(prologue.text)
             self._parameters.append(f"const {prologue.struct} prologue")
-            opening.append(f"if (block < 0) {{ {prologue.function}(prologue, blockIdx.x); return; }}")
+            begin.append(f"if (block < 0) {{ {prologue.function}(prologue, blockIdx.x); return; }}")
+        if self._opening:
+            lines.append(self._opening.text)
+            self._parameters.append(f"const {self._opening.struct} opened")
+            begin.append(f"{self._opening.whole}(opened);")
         heading = f'extern "C" __global__ void __launch_bounds__({shape.threads}) fused(int n'
         parameters = "".join(f", {p}" for p in self._parameters)
-        opening += guard.lines if guard and not epilogue else []
-        lines += [f"{heading}{parameters}) {{", *opening, *self._setup, *body_lines, "}"]
+        begin += guard.lines if guard and not epilogue else []
+        lines += [f"{heading}{parameters}) {{", *begin, *self._setup, *body_lines, "}"]
         self.source = "\n".join(lines)
 
     def _each(self) -> Iterator[tuple[int, DeviceLaunch, str, str]]:
@@ -273,6 +294,7 @@ class FusedSource:
         lines = [
             "const int i = block * BLOCK_ITEMS + threadIdx.x;",
             f"if (threadIdx.x < BLOCK_ITEMS && i < n{taken}) {{",
+            *([f"{self._opening.item}(opened, i);"] if self._opening else []),
         ]
         rows: dict[int, str] = {}
         for k, launch, space, kernel in self._each():

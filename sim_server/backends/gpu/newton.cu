@@ -3,11 +3,13 @@
 //     assemble, begin_newton, trial, while a body is not done (blocks of A, trial), end_newton, integrate
 //     trial: pcg, update_state, forces, accept_trial
 // with all trials that a scene allows in place of the loop where the driver has none: linearizations (1 + trials). The device decides:
-// the phase of a body tells each launch whether it applies to the body; once all bodies are done, launches return at once.
+// the phase of a body tells each launch whether it applies to the body; once all bodies are done, launches return at once. The kernels that
+// decide tell the loop, too, and the end is part of the kernel that integrates (newton_end.cuh), since each launch takes its time.
 //
 // With a bound of the error of positions (ERRORS), a trial that was taken is judged by the next solve, whose first P^-1 b tells the
 // displacement that is left: where that is within the bound, or no more linearizations are allowed, it ends the search (bounded_search.cuh).
 #include "newton_begin.cuh"
+#include "newton_end.cuh"
 #include "bounded_search.cuh"
 #ifdef BUDGETS
 #include "clock.cuh"
@@ -32,19 +34,27 @@ __device__ __forceinline__ bool sum_lanes(const NewtonArguments& p, const NodeRa
     return sum_body(p, here, blockIdx.x, sum, PARTS);
 }
 
-__device__ __forceinline__ PcgResult& result_of(const NewtonArguments& p, int body) {
-    return p.results[(p.step[0] % p.capacity) * p.count + body];
+#ifdef LOOPS
+extern "C" __device__ void cudaGraphSetConditional(unsigned long long handle, unsigned value);  // of the driver, which links it
+#endif
+
+// Tells the loop of the step's graph, 0: there is none, whether it goes on. It does not unless it is told.
+__device__ __forceinline__ void tell_loop([[maybe_unused]] unsigned long long loop, [[maybe_unused]] bool goes_on) {
+#ifdef LOOPS
+    if (loop) cudaGraphSetConditional(loop, goes_on);
+#endif
 }
 
-// Publishes the phase of a body after a decision.
-__device__ __forceinline__ void decided(const NewtonArguments& p, int body) {
+// Publishes the phase of a body after a decision. The last body to be done ends the loop, in which no other says anything else then.
+__device__ __forceinline__ void decided(const NewtonArguments& p, int body, unsigned long long loop) {
     const int phase = p.search[body].phase;
 #ifdef ERRORS
     p.phase[body] = is_awaited(phase) ? SOLVE : phase;
 #else
     p.phase[body] = phase;
 #endif
-    if (phase == DONE) atomicSub(p.active, 1);
+    if (phase != DONE) tell_loop(loop, true);
+    else if (atomicSub(p.active, 1) == 1) tell_loop(loop, false);
 }
 
 // Search direction of node i after the solve: R y; at the first linearization plus the predictor, from which it starts.
@@ -54,20 +64,6 @@ __device__ __forceinline__ void direction_of(const NewtonArguments& p, int i, bo
     if (!first) return;
     const real* predictor = p.initial_state + 6ll * p.nodes + 3 * i;
     for (int k = 0; k < 3; ++k) direction[k] += predictor[k];
-}
-
-// Node i within the search, read at once.
-struct SearchedNode {
-    StartOfStep start;
-    double increment[3], direction[3], beta;
-};
-__device__ __forceinline__ SearchedNode searched_node(const NewtonArguments& p, int i) {
-    SearchedNode node = {kept_start(p, i), {}, {}, (double)p.beta[i]};
-    for (int c = 0; c < 3; ++c) {
-        node.increment[c] = p.increment[3 * i + c];
-        node.direction[c] = p.direction[3 * i + c];
-    }
-    return node;
 }
 
 // Sets the state of node i to that after increment + scale direction.
@@ -90,7 +86,7 @@ extern "C" __global__ void __launch_bounds__(BLOCK_NODES) begin_newton(const New
 
 #ifdef ERRORS
 // Ends a search whose state a solve has judged: adds z to the increment, which is zero where it is not to be.
-__device__ __forceinline__ void end_search(const NewtonArguments& p, const NodeRange& here, int i, bool mine) {
+__device__ __forceinline__ void end_search(const NewtonArguments& p, const NodeRange& here, int i, bool mine, unsigned long long loop) {
     const int body = here.body;
     Search& search = p.search[body];
     if (mine) {
@@ -106,7 +102,7 @@ __device__ __forceinline__ void end_search(const NewtonArguments& p, const NodeR
     search.seconds += result_of(p, body).seconds;
     search.verdict = NONE_YET;
     search.phase = DONE;
-    decided(p, body);
+    decided(p, body, loop);
 }
 #endif
 
@@ -130,7 +126,7 @@ __device__ __forceinline__ void multiply_row(const NewtonArguments& p, int begin
 
 // Sets the state of the next trial: along a new direction after a solve, else with a shorter step along the present one.
 // Reads that do not depend on each other stand together, since their latencies are most of its time.
-extern "C" __global__ void __launch_bounds__(ALL_LANES) update_state(const NewtonArguments p) {
+extern "C" __global__ void __launch_bounds__(ALL_LANES) update_state(const NewtonArguments p, unsigned long long loop) {
     const NodeRange here = p.ranges[blockIdx.x / PARTS];
     const PcgResult& r = result_of(p, here.body);
     Search& search = p.search[here.body];
@@ -150,7 +146,7 @@ extern "C" __global__ void __launch_bounds__(ALL_LANES) update_state(const Newto
         return;
     }
 #ifdef ERRORS
-    if (is_over(search, r, p.bodies[here.body].position > 0)) return end_search(p, here, i, mine);
+    if (is_over(search, r, p.bodies[here.body].position > 0)) return end_search(p, here, i, mine, loop);
 #endif
     const bool lost = status == NOT_FINITE, first = linearizations == 0;
     double sum[2] = {0, 0};
@@ -187,11 +183,11 @@ extern "C" __global__ void __launch_bounds__(ALL_LANES) update_state(const Newto
     search.solve_error = as_known(r.solve_error);
 #endif
     if (!lost) begin_line_search(search, sum[0], sqrt(sum[1]));
-    decided(p, here.body);
+    decided(p, here.body, loop);
 }
 
 // Decides on an assembled trial: accept, shorten, or end the iteration.
-extern "C" __global__ void __launch_bounds__(BLOCK_NODES) accept_trial(const NewtonArguments p) {
+extern "C" __global__ void __launch_bounds__(BLOCK_NODES) accept_trial(const NewtonArguments p, unsigned long long loop) {
     const NodeRange here = p.ranges[blockIdx.x];
     Search& search = p.search[here.body];
     const int i = here.first + threadIdx.x, phase = search.phase;
@@ -227,64 +223,13 @@ extern "C" __global__ void __launch_bounds__(BLOCK_NODES) accept_trial(const New
     clock.forces = 1e-9 * (clock.decided - clock.solved);
     end_by_budget(search, settings, clock, *p.begun, clock.decided);
 #endif
-    decided(p, here.body);
+    decided(p, here.body, loop);
 }
 
-// First node of a body whose b is not finite, -1: there is none. By a warp.
-__device__ __forceinline__ int first_bad_node(const NewtonArguments& p, const NodeRange& first_of_body) {
-    constexpr int NONE_FOUND = 0x7fffffff;
-    const int first = first_of_body.first, nodes = p.ranges[first_of_body.first_range + first_of_body.ranges - 1].last - first;
-    int bad = NONE_FOUND;
-    for (int k = threadIdx.x; k < nodes && bad == NONE_FOUND; k += 32) {
-        const real* b = p.b + 3ll * (first + k);
-        if (!(isfinite(b[0]) && isfinite(b[1]) && isfinite(b[2]))) bad = k;
-    }
-    for (int by = 16; by; by >>= 1) bad = min(bad, __shfl_xor_sync(WHOLE_WARP, bad, by));
-    return bad == NONE_FOUND ? -1 : bad;
-}
-
-// By the first thread block of a body: the results of the step.
-__device__ __forceinline__ void write_results(const NewtonArguments& p, const NodeRange& here, const Search& s) {
-    const int body = here.body, bad = s.status == NOT_FINITE ? first_bad_node(p, here) : -1;
-    const PcgBody& settings = p.bodies[body];
-    if (threadIdx.x) return;
-    PcgResult& r = result_of(p, body);
-    const bool used = settings.plan && (r.asked == CHOLESKY || s.kind == CHOLESKY || s.fallbacks);
-    r.factor_step = used ? settings.factor_step : -1;
-    r.residual = s.residual;
-    r.seconds = s.seconds;
-    r.iterations = s.iterations;
-    r.status = s.status;
-    r.kind = s.kind;
-    r.fallbacks = s.fallbacks;
-    r.bad_node = bad;
-    NewtonResult& told = p.newton_results[(p.step[0] % p.capacity) * p.count + body];
-    told = {residual_ratio(s), s.linearizations > 1 ? s.linearizations : 1};
-#ifdef ERRORS
-    r.solve_error = as_told(s.solve_error);
-    told.step_error = as_told(s.step_error);
-#endif
-}
-
-// Restores the state before the step, and sets y so that `advance` arrives at the state found; writes the results of the step.
+// Ends the iteration where that is not done within another kernel.
 extern "C" __global__ void __launch_bounds__(BLOCK_NODES) end_newton(const NewtonArguments p) {
     const NodeRange here = p.ranges[blockIdx.x];
     const int i = here.first + threadIdx.x;
-    const Search s = p.search[here.body];
-    if (blockIdx.x == 0 && threadIdx.x == 0) *p.active = p.count;  // of the next step
-    if (i < here.last) {
-        const SearchedNode node = searched_node(p, i);
-        double increment[3], y[3];
-        for (int c = 0; c < 3; ++c) increment[c] = increment_after(s, node.increment[c], node.direction[c]);
-        rotate_node(p.rotation + 9ll * i, true, increment, y);
-        for (int c = 0; c < 3; ++c) {
-            const int k = 3 * i + c;
-            p.x[k] = node.start.x[c];
-            p.v[k] = node.start.v[c];
-            p.predictor[k] = node.start.predictor[c];
-            p.inertial_increment[k] = node.start.inertial_increment[c];
-            p.y[k] = (real)y[c];
-        }
-    }
-    if ((int)blockIdx.x == here.first_range) write_results(p, here, s);
+    if (i < here.last) end_node(p, i, here.body);
+    end_step_of_newton(p, blockIdx.x, gridDim.x);
 }

@@ -9,7 +9,6 @@ bodies that are done, the kernels of trials begin with a guard (kernel_fusion.Ph
 """
 
 from collections.abc import Mapping, Sequence
-from contextlib import AbstractContextManager
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -17,9 +16,18 @@ from numpy.typing import NDArray
 
 from sim_server.arrays import Int32, Int64
 from sim_server.backends.declarations import Declarations
-from sim_server.backends.gpu.cupy_types import DeviceArray, KernelFunction
+from sim_server.backends.gpu.conditions import Loop
+from sim_server.backends.gpu.cupy_types import DeviceArray, KernelFunction, KernelModule
 from sim_server.backends.gpu.device import DeviceLaunch, Gpu, compiled, options, own_headers
-from sim_server.backends.gpu.kernel_fusion import DOMAINS, FusedKernel, PhaseGuard, Prologue, SolveGuard, fuse
+from sim_server.backends.gpu.kernel_fusion import (
+    DOMAINS,
+    FusedKernel,
+    Opening,
+    PhaseGuard,
+    Prologue,
+    SolveGuard,
+    fuse,
+)
 from sim_server.backends.gpu.solver import PcgSolver
 from sim_server.backends.gpu.structs import NEWTON_RESULT
 from sim_server.backends.newton import Newton
@@ -71,8 +79,12 @@ class Loops(Protocol):
     @property
     def has_conditions(self) -> bool: ...
 
-    def repeat(self, flag: DeviceArray) -> AbstractContextManager[None]:
-        """What is launched inside runs as long as `flag` (1,) is not 0."""
+    def loop(self) -> Loop:
+        """Makes a loop of the graph that is captured now, whose kernels tell it whether it goes on."""
+        ...
+
+    def linked(self, text: str, name: str, options: Sequence[str]) -> KernelModule:
+        """Compiles a text whose kernels tell loops."""
         ...
 
 
@@ -136,6 +148,7 @@ class NewtonIteration:
     results: host memory (capacity, bodies) of NEWTON_RESULT that the steps write to
     readers: launches after the step's end that read what the last assembly made
     beside: begins the iteration within the first assembly; None: a launch of its own does
+    within: whether the kernel that integrates ends the iteration (ending); else a launch of its own does
 
     The array `values` keeps A of the first linearization of a step, from which factors are made; later ones have
     another.
@@ -149,7 +162,7 @@ class NewtonIteration:
     def __init__(
         self, gpu: Gpu, device: Loops, newton: Newton, again: Sequence[DeviceLaunch], ranges: Sequence[tuple[int, int]],
         arrays: Mapping[str, NDArray[Any]], phases: NewtonPhases, solver: PcgSolver, results: NDArray[Any],
-        readers: Sequence[DeviceLaunch] = (), beside: Prologue | None = None,
+        readers: Sequence[DeviceLaunch] = (), beside: Prologue | None = None, within: bool = False,
     ):  # fmt: skip
         cp, nodes, bodies = gpu.cp, len(arrays["x"]), len(ranges)
         self._gpu, self._device, self._solver, self.rounds = gpu, device, solver, newton.options.rounds
@@ -170,6 +183,7 @@ class NewtonIteration:
         self._memory = twins | {
             "ranges": cp.asarray(spans.view(np.int32)),
             "diagonal": cp.asarray(own_blocks(arrays["row_start"], arrays["columns"])),
+            "body": cp.asarray(np.repeat(np.arange(bodies, dtype=np.int32), [last - first for first, last in ranges])),
             "partial_sums": cp.zeros(2 * PARTS * len(spans)), "finished_blocks": cp.zeros(bodies, np.uint32),
             "search": phases.search, "phase": phases.phase, "active": phases.active, "begun": solver.begun,
             "clocks": solver.clocks, "step": solver.counter, "pool_counter": solver.pool_counter,
@@ -178,7 +192,7 @@ class NewtonIteration:
             "direction": cp.zeros(3 * nodes),
         }  # fmt: skip
         self._params = beside.params if beside else np.zeros((), NEWTON_ARGUMENTS)
-        self._begins_beside = beside is not None
+        self._begins_beside, self._ends_within = beside is not None, within
         for name, array in self._memory.items():
             self._params[name] = array.data.ptr
         self._params["newton_results"], self._params["bodies"] = results.ctypes.data, solver.bodies_device
@@ -189,8 +203,13 @@ class NewtonIteration:
         self._later_params = self._params.copy()
         self._later_params["values"] = self._values.data.ptr
         kinds = {"ERRORS": solver.errors, "BUDGETS": solver.budgets}
-        flags = (*options(gpu.types), *own_headers(), *(f"-D{kind}" for kind, wanted in kinds.items() if wanted))
-        module = gpu.cp.RawModule(code=NEWTON.checked(), options=flags, backend="nvrtc")
+        defined = [kind for kind, wanted in kinds.items() if wanted]
+        flags = (*options(gpu.types), *own_headers(), *(f"-D{kind}" for kind in defined))
+        self._definitions = "".join(f"#define {kind}\n" for kind in defined)
+        if self.loops:
+            module = device.linked(NEWTON.checked(), "newton.cu", (*flags, "-DLOOPS"))
+        else:
+            module = gpu.cp.RawModule(code=NEWTON.checked(), options=flags, backend="nvrtc")
         self._begin, self._update_state, self._accept_trial, self._end = (
             compiled("newton.cu", module, name)
             for name in ("begin_newton", "update_state", "accept_trial", "end_newton")
@@ -217,6 +236,11 @@ class NewtonIteration:
         """Returns the array that follows the pattern of A, and its contents for this one."""
         return self._memory["diagonal"], own_blocks(row_start, columns)
 
+    def ending(self) -> Opening | None:
+        """Returns what ends the iteration at the beginning of the kernel that integrates, if that does it."""
+        text = f'{self._definitions}#include "newton_end.cuh"'
+        return Opening(text, "NewtonArguments", "end_item", "end_within", self._params) if self._ends_within else None
+
     def launch(self) -> None:
         """Launches the whole iteration of a step whose first linearization has been assembled.
 
@@ -224,28 +248,33 @@ class NewtonIteration:
         """
         if not self._begins_beside:
             self._launch(self._begin, BLOCK_NODES, self._params)
-        self._trial(self._params, None)
-        if self.loops:
-            with self._device.repeat(self._memory["active"]):
-                self._later_trial()
+        loop = self._device.loop() if self.loops else None
+        self._trial(self._params, None, loop)
+        if loop:
+            with loop.body():
+                self._later_trial(loop)
         else:
             for _ in range(self.rounds - 1):
-                self._later_trial()
-        self._launch(self._end, BLOCK_NODES, self._params)
+                self._later_trial(None)
+        if not self._ends_within:
+            self._launch(self._end, BLOCK_NODES, self._params)
 
-    def _later_trial(self) -> None:
+    def _later_trial(self, loop: Loop | None) -> None:
         """Launches a trial after the first one, of a new linearization or of a shorter step."""
         for launch in self._blocks:
             launch()
-        self._trial(self._later_params, self._values)
+        self._trial(self._later_params, self._values, loop)
 
-    def _trial(self, params: NDArray[Any], values: DeviceArray | None) -> None:
+    def _trial(self, params: NDArray[Any], values: DeviceArray | None, loop: Loop | None) -> None:
         """Launches a solve, the state that it gives, the forces there and the decision. values: A; None: the first."""
+        told = np.uint64(loop.handle if loop else 0)
         self._solver.launch(values)
-        self._launch(self._update_state, BLOCK_NODES // PARTS * LANES, params, PARTS)
+        self._launch(self._update_state, BLOCK_NODES // PARTS * LANES, params, told, parts=PARTS)
         for launch in self._forces:
             launch()
-        self._launch(self._accept_trial, BLOCK_NODES, params)
+        self._launch(self._accept_trial, BLOCK_NODES, params, told)
 
-    def _launch(self, function: KernelFunction, threads: int, params: NDArray[Any], parts: int = 1) -> None:
-        function((self._grid * parts,), (threads,), (params,))
+    def _launch(
+        self, function: KernelFunction, threads: int, params: NDArray[Any], *told: np.uint64, parts: int = 1
+    ) -> None:  # fmt: skip
+        function((self._grid * parts,), (threads,), (params, *told))

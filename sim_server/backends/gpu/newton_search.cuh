@@ -25,6 +25,7 @@ struct NewtonArguments {
     int* phase;                    // (bodies,) of each body's search, read by the other launches
     int* active;                   // (1,) bodies whose iteration is not over
     const PcgBody* bodies;
+    const int* body;               // (nodes,) of the node
     PcgResult* results;            // (capacity, bodies) of the last solve; at the end of the step
     NewtonResult* newton_results;  // (capacity, bodies) on the host
     const long long* step;         // (1,) completed

@@ -138,23 +138,42 @@ struct PcgSolver {
         for (int k = threadIdx.x; k < rows.halo; k += THREADS) {
             int node = rows.nodes[k];
             rows.place[k] = packed ? memory.plan.place[node] : 3 * (memory.body.first + node);
+#ifdef CUTS
+            if (packed && s.at_rest[memory.body.first + node] != 0) rows.place[k] |= APART;
+#endif
         }
         __syncthreads();
         if (!packed || !memory.d) return;
-        for (int k = threadIdx.x; k < 3 * rows.own; k += THREADS) memory.d[k] = memory.inverse.scale[rows.place[k / 3] + k % 3];
+        for (int k = threadIdx.x; k < 3 * rows.own; k += THREADS) memory.d[k] = memory.inverse.scale[rows.position(k / 3) + k % 3];
     }
 
     static __device__ __forceinline__ real scale_of(int k) {
-        return memory.d ? memory.d[k] : (real)memory.inverse.scale[memory.rows.place[k / 3] + k % 3];
+        return memory.d ? memory.d[k] : (real)memory.inverse.scale[memory.rows.position(k / 3) + k % 3];
     }
 
     // Writes d r of an own degree of freedom for all thread blocks.
-    __device__ __forceinline__ void publish(int half, int k, real r) const {
-        residuals(half)[memory.rows.place[k / 3] + k % 3].put((float)(scale_of(k) * r), group.number);
+    __device__ __forceinline__ void publish(int half, int k, real r) const { put_own(residuals(half), k, r); }
+    __device__ __forceinline__ void publish_product(int k, real q) const { put_own(memory.inverse.product, k, q); }
+
+    __device__ __forceinline__ void put_own(FlagWord<float>* to, int k, real v) const {
+        float scaled = (float)(scale_of(k) * v);
+#ifdef CUTS
+        if (memory.rows.place[k / 3] & APART) scaled = 0;
+#endif
+        to[memory.rows.position(k / 3) + k % 3].put(scaled, group.number);
     }
-    __device__ __forceinline__ void publish_product(int k, real q) const {
-        memory.inverse.product[memory.rows.place[k / 3] + k % 3].put((float)(scale_of(k) * q), group.number);
+
+    // z at entry k of the halo, by what P has made there.
+    __device__ __forceinline__ float applied(const BlockRows& rows, int k, float z) const {
+#ifdef CORRECTED
+        if (corrects) z -= correction_at(rows, k);
+#endif
+#ifdef CUTS
+        if (rows.place[k / 3] & APART) z = 0;
+#endif
+        return z;
     }
+
     static __device__ __forceinline__ FlagWord<float>* residuals(int half) {
         return memory.inverse.residual + (long long)half * (memory.inverse.size + 32);
     }
@@ -339,13 +358,8 @@ struct PcgSolver {
     __device__ __forceinline__ void direction(real beta, double out[4]) {
 #endif
         const BlockRows rows = memory.rows;
-#ifdef CORRECTED
-        if (packed) rows.form(memory.inverse.z, z_number, beta, [&](int k) { return corrects ? correction_at(rows, k) : 0.0f; });
-        else rows.form(s.z, z_number, beta, [](int) { return 0.0f; });
-#else
-        if (packed) rows.form(memory.inverse.z, z_number, beta);
-        else rows.form(s.z, z_number, beta);
-#endif
+        if (packed) rows.form(memory.inverse.z, z_number, beta, [&](int k, float z) { return applied(rows, k, z); });
+        else rows.form(s.z, z_number, beta, [](int, real z) { return z; });
 #ifdef ERRORS
         double z2 = largest2([&](int k) { return rows.q[k]; });
         __syncthreads();
@@ -501,6 +515,12 @@ struct PcgSolver {
                 if (known) spring = spring_difference(c.springs[node], then, now);
             }
             if (!known) continue;
+#ifdef CUTS
+            if (rows.place[k] & APART) {
+                __stcg(c.share + node, 0.0f);
+                continue;
+            }
+#endif
             const int pair = c.pair && step - then < HISTORY ? c.pair[node] : -1;
             if (spring != 0 || pair >= 0) {
                 int at = rows.row_start[k] - rows.base;
@@ -541,7 +561,7 @@ struct PcgSolver {
     __device__ __forceinline__ void keep_column() const {
         const BlockRows& rows = memory.rows;
         for (int k = threadIdx.x; k < 3 * rows.own; k += THREADS) {
-            const FlagWord<float>* z = memory.inverse.z + rows.place[k / 3] + k % 3;
+            const FlagWord<float>* z = memory.inverse.z + rows.position(k / 3) + k % 3;
             float value;
             for (unsigned spins = 0; keep_polling(!z->get(value, group.number), spins);) {}
             __stcg(const_cast<float*>(correction_row(rows.begin + k / 3)) + k % 3 * given_correction.width + column, value);

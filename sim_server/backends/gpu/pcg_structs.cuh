@@ -98,6 +98,7 @@ struct PcgArguments {
     const long long* begun;        // (1,) time at which the step began [ns]
     TrialClock* clocks;            // (bodies,)
     const int* moving;             // (bodies,) 0: the body rests (kernels/nodes.cu)
+    const real* at_rest;           // -DCUTS: (nodes,) 1 at nodes without elements (cut_nodes.cuh)
     const long long* split_step;   // -DSPLITS: (bodies,) steps completed when the body was split last: older factors are not used
     int nodes, shared;             // of the scene; bytes of dynamic shared memory
 };

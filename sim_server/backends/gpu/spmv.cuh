@@ -3,6 +3,9 @@
 // all nodes that its rows read (the halo, own nodes first), so that it forms a search direction itself where it is used.
 #pragma once
 #include "block_group.cuh"
+#ifdef CUTS
+#include "cut_nodes.cuh"
+#endif
 #include "invert3.cuh"
 
 #define TOGETHER 3                   // rows that a warp multiplies at a time
@@ -15,7 +18,7 @@ struct BlockRows {
     int begin, own, halo;  // own nodes [begin, begin + own) of the body; nodes read
     const int* nodes;      // (halo,) of the body
     real* values;          // (halo, 3) of the vector that A multiplies
-    int* place;            // (halo,) position from which its next values are read
+    int* place;            // (halo,) position from which its next values are read; -DCUTS: and flags of cut_nodes.cuh
     real *x, *r, *q;       // (own, 3)
 #ifdef ERRORS
     real* before;          // (own, 3) x at the last look (iterate_error.cuh)
@@ -28,6 +31,15 @@ struct BlockRows {
     bool near;             // the rows of A are in shared memory
     int slabs;             // offset of the buffers (SLABS, SLAB_BYTES) in shared memory, or -1
     int near_values, near_blocks, near_columns;  // offsets in shared memory, if they are there
+
+    // Position from which the values of a node of the halo are read.
+    __device__ __forceinline__ int position(int node) const {
+#ifdef CUTS
+        return place[node] & PLACE;
+#else
+        return place[node];
+#endif
+    }
 
     // Allocates shared memory, for the most frequently used arrays first. inverted: there is an inverse.
     __device__ __forceinline__ void set_up(const PcgArguments& s, const PcgBody& body, const RowRange& range, Arena& arena, bool inverted) {
@@ -240,14 +252,9 @@ struct BlockRows {
     }
 
     // values = (values of exchange `number`) + beta values, for all nodes of the halo.
-    // less: what is taken off the values of the exchange, by entry of the halo.
-#ifdef CORRECTED
-    template <class T, class Less>
-    __device__ __forceinline__ void form(const FlagWord<T>* from, unsigned number, real beta, Less less) const {
-#else
-    template <class T>
-    __device__ __forceinline__ void form(const FlagWord<T>* from, unsigned number, real beta) const {
-#endif
+    // changed(k, value): what becomes of a value of the exchange, by entry of the halo.
+    template <class T, class Changed>
+    __device__ __forceinline__ void form(const FlagWord<T>* from, unsigned number, real beta, Changed changed) const {
         for (int first = threadIdx.x; first < 3 * halo; first += 3 * THREADS) {
             FlagWord<T> seen[3];
             T got[3];
@@ -256,7 +263,7 @@ struct BlockRows {
 #pragma unroll
             for (int n = 0; n < 3; ++n) {
                 const int k = min(first + n * THREADS, 3 * halo - 1);
-                at[n] = place[k / 3] + k % 3;
+                at[n] = position(k / 3) + k % 3;
             }
             unsigned spins = 0;
             do {  // no branch between the loads: they travel together
@@ -269,9 +276,7 @@ struct BlockRows {
 #pragma unroll
             for (int n = 0; n < 3; ++n) {
                 const int k = first + n * THREADS;
-#ifdef CORRECTED
-                if (k < 3 * halo) got[n] -= less(k);
-#endif
+                if (k < 3 * halo) got[n] = changed(k, got[n]);
 #ifdef ERRORS
                 if (k < 3 * own) q[k] = got[n];  // A p is formed next
 #endif

@@ -23,7 +23,8 @@ class Case:
     """A scene with one object. dt [s]: of its file; seconds: that are simulated; length [m]: what errors are told over.
 
     cells: of its mesh, a bar; law: its elasticity; laws: others with the same constants; explicit: explicit substeps
-    are short enough to make references; contact: steps are of backward Euler; exact: what an exactly solved step needs
+    are short enough to make references; contact: steps are of backward Euler; settled: a step goes to
+    equilibrium; exact: what an exactly solved step needs
     beside NEWTON; positions [m]: bounds of the error of a step; always: overrides of
     a small run.
     """
@@ -40,6 +41,7 @@ class Case:
     laws: tuple[str, ...] = ()
     explicit: bool = False
     contact: bool = False
+    settled: bool = False
     positions: tuple[str, ...] = ("1e-2", "1e-3", "1e-4")
     exact: Settings = field(default_factory=dict, hash=False)
     always: Settings = field(default_factory=dict, hash=False)
@@ -77,6 +79,10 @@ FLOOR = Case(
     "block on a floor", HERE / "on_floor.toml", "block", 0.2, 0.01, 0.5, (8, 4, 8), "corotational",
     "{ young = 1e4, poisson = 0.4 }", ("stable_neo_hookean",), contact=True, positions=("1e-4", "1e-5", "1e-6"),
     exact={"effects.contact.tolerance": "1e-9", "effects.contact.passes": "200"},
+)  # fmt: skip
+ROLLERS = Case(
+    "block on rollers", HERE / "on_rollers.toml", "block", 4.0, 1.0, 1.0, (8, 1, 32), "corotational",
+    "{ young = 1e6, poisson = 0.3 }", settled=True,
 )  # fmt: skip
 CASES = (BEAM, BANDS, RUBBER, FLOOR)
 SMALL = replace(BEAM, seconds=0.2, cells=(2, 2, 8), always=BEAM.meshed((2, 2, 8)))  # for a smoke run

@@ -12,7 +12,7 @@ import numpy as np
 from clients.accuracy.sources import LINEAR, LINEARIZATION, MESH, MODEL, length
 from clients.accuracy.sources import TIME as STEP
 from clients.accuracy.trajectories import shared_nodes
-from tests.bench.accuracy.cases import Case, Settings, usual
+from tests.bench.accuracy.cases import NEWTON, Case, Settings, usual
 from tests.bench.accuracy.motion import Motion, error, exact_solve, exact_step, move, reference, rms
 
 Row = dict[str, Any]
@@ -30,6 +30,7 @@ FIRST = {  # to change
     MESH: "a finer mesh",
 }
 CELLS = (2, 4, 8, 16)  # across, of the meshes that tell the order; four times as many along
+PLANE_CELLS = (4, 8, 16, 32, 64)  # likewise, of what is strained in a plane alone
 
 
 def rows(case: Case) -> list[Row]:
@@ -84,12 +85,12 @@ def orders(sizes: Sequence[float], errors: Sequence[float | None], floor: float 
 
 @cache
 def on_mesh(case: Case, cells: tuple[int, int, int]) -> Motion:
-    """The motion on another mesh, by small steps: the same ones on all meshes of a scene."""
-    if case.explicit:
+    """The motion on another mesh, by small steps: the same ones on all meshes of a scene. What settles does so."""
+    if case.settled:
+        settings: Settings = usual(case.meshed(cells), NEWTON)
+    elif case.explicit:
         coarse = 2 * float(reference(case).settings["dt"])
-        settings: Settings = usual(
-            case.meshed(cells), {"integrator.scheme": "central_difference"}, case.stepped(coarse)
-        )
+        settings = usual(case.meshed(cells), {"integrator.scheme": "central_difference"}, case.stepped(coarse))
     else:
         scheme = {} if case.contact else {"integrator.scheme": "newmark"}
         newton = {"integrator.linearizations": "3", "solver.tolerance": "1e-4", "solver.update": "lockstep-20"}
@@ -104,7 +105,7 @@ def _finer(cells: tuple[int, int, int]) -> tuple[int, int, int]:
 
 def of_meshes(case: Case, cells: Sequence[int] = CELLS) -> list[Row]:
     """How far each mesh is from the next finer one, in L2: root mean square [m] over the nodes of the coarsest one."""
-    motions = [on_mesh(case, (n, n, 4 * n)) for n in cells]
+    motions = [on_mesh(case, (n, 1 if case.settled else n, 4 * n)) for n in cells]
     nodes = motions[0]
     return [
         {"scene": case.name, "cells across": n, "tets": coarse.tets, "h m": 1.0 / n, "length": case.length,

@@ -6,7 +6,7 @@ from functools import partial
 from pathlib import Path
 
 from tests.bench.accuracy import axes, effectivity, peers, points, sources
-from tests.bench.accuracy.cases import CASES, SMALL, Case
+from tests.bench.accuracy.cases import CASES, ROLLERS, SMALL, Case
 from tests.bench.harness.pieces import Row, say
 from tests.bench.harness.units import Unit
 
@@ -28,6 +28,8 @@ def units(device: str, rounds: int, quick: bool, python: Path | None) -> list[Un
     if device == "cpu":
         found += [Unit("sources", case.name, 90, partial(sources.rows, case)) for case in cases]
         cells = sources.CELLS[:3] if quick else sources.CELLS
+        plane = sources.PLANE_CELLS[:3] if quick else sources.PLANE_CELLS
+        found.append(Unit("meshes", ROLLERS.name, 60, partial(sources.of_meshes, ROLLERS, plane)))
         explicit = [case for case in cases if case.explicit]
         found += [Unit("meshes", case.name, 100, partial(sources.of_meshes, case, cells)) for case in explicit]
     for case in cases:

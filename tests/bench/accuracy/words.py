@@ -47,9 +47,10 @@ make them shorter."""
 
 MESHES = """\
 Distance of each mesh from the next finer one, root mean square over times and the nodes of the coarsest mesh (L2),
-by the same small steps on all of them; p from each three neighbours. It should be 2 for a smooth solution. A beam
-that is held at a whole face has a singularity along that face's edges, and coarse meshes of linear tetrahedra are
-too stiff: both may make it smaller."""
+by the same small steps on all of them; p from each three neighbours. It should be 2 for a smooth solution. That of the
+*block on rollers* is one (`tests/bench/accuracy/on_rollers.toml`): in equilibrium and plane strain, one cell thick,
+bent by a moment, held along the normals of planes alone. A beam that is held at a whole face has a singularity along
+that face's edges, and coarse meshes of linear tetrahedra are too stiff: both make it smaller."""
 
 AXES = """\
 One axis at a time, or the two that matter together. Horizontal: error; vertical: seconds of a simulated second.
