@@ -20,11 +20,13 @@ import json
 import math
 import sys
 import time
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 from websockets.exceptions import WebSocketException
-from websockets.sync.client import ClientConnection, connect
+from websockets.sync.client import connect
+from websockets.sync.connection import Connection
 
 from clients.client import Client
 from clients.errors import BadInput, ClientError
@@ -68,14 +70,14 @@ def triple(given: dict[str, Any], *names: str) -> list[float]:
 class Bridge:
     """One server on one side, rosbridge on the other."""
 
-    def __init__(self, client: Client, ros: ClientConnection, frame_id: str, stiffness: float, max_force: float):
+    def __init__(self, client: Client, ros: Connection, frame_id: str, stiffness: float, max_force: float):
         self.client, self.ros, self.frame_id = client, ros, frame_id
-        self.spring = {"stiffness": stiffness, "max_force": max_force}  # of grabs
+        self.stiffness, self.max_force = stiffness, max_force  # of grabs
         self.objects = list(client.scene().objects)
         self.tools = {o.name: client.obstacle(o.name) for o in client.obstacles().values() if o.moved == "client"}
         self.grabs: dict[str, Grab] = {}
         self.states = client.states()
-        self.taken = {}
+        self.taken: dict[str, Callable[[dict[str, Any]], None]] = {}
         for name in self.objects:
             self.offer(f"{name}/points", "sensor_msgs/PointCloud2")
             self.offer(f"{name}/grab_wrench", "geometry_msgs/WrenchStamped")
@@ -134,11 +136,11 @@ class Bridge:
 
     def grab(self, name: str, message: dict[str, Any]) -> None:
         """Grabs the node next to a point, or moves the grab that there is."""
-        point = triple(message["point"], *"xyz")
+        x, y, z = triple(message["point"], *"xyz")
         if name in self.grabs:
-            self.grabs[name].move(point, wait=False)
+            self.grabs[name].move((x, y, z), wait=False)
         else:
-            self.grabs[name] = self.client.grab(name, tuple(point), **self.spring)
+            self.grabs[name] = self.client.grab(name, (x, y, z), None, 0, self.stiffness, self.max_force)
 
     def release(self, name: str) -> None:
         """Lets go."""
