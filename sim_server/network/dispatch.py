@@ -5,6 +5,8 @@ import logging
 import threading
 import time
 from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
+from functools import partial
 
 import numpy as np
 import zenoh
@@ -12,6 +14,7 @@ import zenoh
 from protocol.channels import CHANNELS, MOST_JOBS, key, name_in
 from protocol.counters import Counters
 from protocol.factor import Factor, FactorPattern
+from protocol.messages_pb2 import Factor as FactorMessage
 from protocol.messages_pb2 import Topology, WorkerInfo
 from protocol.refused import Refused
 from protocol.shared_memory.pool import Slot, SlotPool
@@ -35,6 +38,7 @@ SMALL_BLOCKS = 20_000  # of the largest matrix, if several jobs may wait at a wo
 QUEUE_SECONDS = 0.02  # s of factorizations that wait at a worker at most
 LOOK_PERIOD = 1e-3  # s between looks at which leases are over
 MAX_SENT = 4096  # times of jobs that are remembered
+LARGE = 4 << 20  # bytes of a factor whose copy and checks take more than a few milliseconds
 SLOT_MARGIN = 8  # the slot for an incomplete factor is larger than the largest factor so far by a SLOT_MARGIN-th
 
 
@@ -71,6 +75,8 @@ class Dispatch(FactorSource):
         self._sent: dict[int, float] = {}  # when the network took a job, by its number
         self._answered_at: dict[str, float] = {}  # likewise, of the answers with a factor
         self._fast_links: set[str] = set()  # workers without shared memory whose link takes a job at once
+        self._thread = ThreadPoolExecutor(1, "large factors")
+        self._decoding: list[tuple[FactorMessage, InFlightJob, Future[Factor]]] = []
         self._factors: list[Factor] = []
         self._failures: list[tuple[str, str]] = []
         self._patterns: list[tuple[str, FactorPattern]] = []
@@ -343,6 +349,7 @@ class Dispatch(FactorSource):
                 self._on_message[channel](sample)
             except Refused as refusal:
                 self._counters.refuse(refusal)
+        self._take_decoded()
         self._query_tokens()
         now = self._clock()
         if now < self._looked_at + LOOK_PERIOD:
@@ -359,7 +366,7 @@ class Dispatch(FactorSource):
             self._on_expired(job, f"was lost: worker {job.worker} says that it has no job")
 
     def _sent_at(self, job: InFlightJob) -> float:
-        return self._sent.get(job.number, float("inf"))
+        return float("inf") if self._is_decoded(job) else self._sent.get(job.number, float("inf"))
 
     def _on_expired(self, job: InFlightJob, why: str) -> None:
         self._fast_links.discard(job.worker)  # zenoh may have dropped the job
@@ -409,18 +416,48 @@ class Dispatch(FactorSource):
     def _on_factor(self, sample: zenoh.Sample) -> None:
         message = self._decoder.parse_factor(sample.key_expr, sample.attachment)
         job = self._leases.match_answer(message.job, message.worker, message.header.epoch)
-        now, seconds = self._clock(), None
+        now = self._clock()
         self._registry.mark_seen(job.worker, now)
         self._free_since[job.worker] = now
         self._reliability.on_answer(job.worker)
         if self._leases.is_reassigned(job):
             return self._leases.finish(job, None if message.failure else message.seconds)
+        decode = partial(self._decoder.decode, message, sample.payload, job)
+        if not message.failure and 4 * message.nonzeros > LARGE:  # its bytes are copied and checked beside the caller
+            if self._is_decoded(job):
+                raise Refused(f"Factor.job is {job.number}, already answered", "duplicate")
+            self._decoding.append((message, job, self._thread.submit(decode)))
+            return
+        self._take_factor(message, job, decode)
+
+    def _is_decoded(self, job: InFlightJob) -> bool:
+        """True while the answer to a job is decoded beside the caller."""
+        return any(other.number == job.number for _, other, _ in self._decoding)
+
+    def _take_decoded(self) -> None:
+        """Takes the large factors that were decoded beside the caller, unless their jobs are over."""
+        done = [each for each in self._decoding if each[2].done()]
+        for each in done:
+            self._decoding.remove(each)
+            message, job, factor = each
+            try:
+                current = self._leases.match_answer(job.number, job.worker, job.epoch)
+                if self._leases.is_reassigned(current):
+                    self._leases.finish(current, message.seconds)
+                else:
+                    self._take_factor(message, current, factor.result)
+            except Refused as refusal:
+                self._counters.refuse(refusal)
+
+    def _take_factor(self, message: FactorMessage, job: InFlightJob, decode: Callable[[], Factor]) -> None:
+        """Takes the answer to a job: the factor that `decode` returns, or a failure."""
+        now, seconds = self._clock(), None
         try:
             if message.failure:
                 self._counters.add("failures")
                 self._reliability.on_failure(job.worker, job.object, now)
                 return self._fail(job, f"failed: {message.failure}")
-            self._factors.append(self._decoder.decode(message, sample.payload, job))
+            self._factors.append(decode())
             seconds = message.seconds
             self._timing.record(job.worker, job.object, self._duration(job, now), seconds)
         except Refused as refusal:

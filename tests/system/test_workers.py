@@ -6,8 +6,10 @@ import logging
 import os
 import re
 import signal
+import threading
 import time
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -77,6 +79,38 @@ def test_several_small_objects_wait_at_one_worker(monkeypatch: pytest.MonkeyPatc
         large = chain(nodes=8000, object="large")
         link.announce(large)
         assert link.dispatch.ready() == 1, "beside a large object each waits for the one before"
+
+
+def test_large_factors_are_decoded_beside_the_caller(monkeypatch: pytest.MonkeyPatch) -> None:
+    """All count as large here; while one is decoded, a second answer to its job is refused."""
+    monkeypatch.setattr(dispatch, "LARGE", 0)
+    endpoint = free_endpoint()
+    with ServerLink(listen=[endpoint]) as link, HandWorker(endpoint, link.incarnation) as hand:
+        driver = Driver(link)
+        link.announce(BEAM)
+        hand.hello()
+        driver.until(link.dispatch.ready, "the worker")
+        driver.submit(BEAM, 1)
+        answer, values = hand.right_answer(hand.receive(), BEAM)
+        decoding, decode = threading.Event(), link.dispatch._decoder.decode
+
+        def slow(*arguments: Any) -> Any:
+            assert decoding.wait(30)
+            return decode(*arguments)
+
+        monkeypatch.setattr(link.dispatch._decoder, "decode", slow)
+        hand.answer(answer, values)
+        hand.answer(answer, values)
+        driver.until(lambda: link.counters.refusals["duplicate"] == 1, "the second answer")
+        assert driver.factors == [] and link.dispatch.ready() == 0
+        decoding.set()
+        driver.until(lambda: driver.factors, "the factor")
+        assert np.allclose(product(driver.factors[0]), dense(BEAM, matrix(BEAM)), atol=1e-5)
+        driver.submit(BEAM, 2)
+        answer, values = hand.right_answer(hand.receive(), BEAM)
+        hand.answer(answer, 2 * values)
+        driver.until(lambda: driver.failures, "the spoiled one")
+        assert "was refused" in driver.failures[0][1] and len(driver.factors) == 1
 
 
 @shared

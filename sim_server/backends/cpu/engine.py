@@ -64,13 +64,10 @@ class NativeFactor:
     def __init__(self, pattern: FactorPattern, values: NDArray[Any], step: int = -1):
         self.pattern = pattern
         self.values = values
-        width, height = np.diff(pattern.super_start).astype(np.int64), np.diff(pattern.row_start)
-        sizes = width * height - width * (width - 1) // 2
-        self._value_start = np.concatenate([[0], np.cumsum(sizes)[:-1]]).astype(np.int64)
         self._pattern = structs.Pattern(
-            size=pattern.size, supernodes=len(width), permutation=pattern.permutation.ctypes.data,
+            size=pattern.size, supernodes=len(pattern.super_start) - 1, permutation=pattern.permutation.ctypes.data,
             super_start=pattern.super_start.ctypes.data, row_start=pattern.row_start.ctypes.data,
-            rows=pattern.rows.ctypes.data, value_start=self._value_start.ctypes.data,
+            rows=pattern.rows.ctypes.data, value_start=pattern.value_start.ctypes.data,
         )  # fmt: skip
         self.native = structs.Factor(
             pattern=c.addressof(self._pattern), values=values.ctypes.data, step=step, bytes=values.itemsize
