@@ -253,6 +253,11 @@ class Engine(Protocol):
         """As `post_factor`, of the factor that was in use when the state that was written was saved."""
         ...
 
+    @property
+    def substeps(self) -> int:
+        """Explicit substeps of the step under way, or of the last one; 0: an implicit scheme, or not known yet."""
+        ...
+
     def settle_factors(self) -> None:
         """Blocks until the next solves will use what was posted."""
         ...

@@ -711,6 +711,11 @@ class CpuEngine(Reports):
         if self._corrects_resumed.get(body) and buffer is not None:
             self._body[body].correction.factor = buffer.address
 
+    @property
+    def substeps(self) -> int:
+        """Explicit substeps of the step under way, or of the last one; 0: an implicit scheme, or not known yet."""
+        return int(self._substeps.native.state.substeps) if self._substeps else 0
+
     def settle_factors(self) -> None:
         """Blocks until posted factors are in use. No-op on the CPU."""
 

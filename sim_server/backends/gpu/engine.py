@@ -469,6 +469,12 @@ class GpuEngine(DeviceLoop):
         """Posts the factor that was in use when the state was saved."""
         self._factor_upload.post(body, pattern, values, step)
 
+    @property
+    def substeps(self) -> int:
+        """Explicit substeps of the first step; 0: an implicit scheme, or not known yet. Those of later ones are in the
+        records."""
+        return self._substeps.first if self._substeps else 0
+
     def settle_factors(self) -> None:
         """Blocks until the next solve will use the posted factors (deterministic policies)."""
         self._factor_upload.settle()
