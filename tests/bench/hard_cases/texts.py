@@ -9,7 +9,7 @@ wrong is one table, too: [When things go wrong](../failures.md). A film of ten t
 [gallery](../gallery.md#hard-cases), and one of all that are known to fail.
 
 *n of m*: of m seeds n hold all of what must hold. In mixed and single precision (GPU) solves may end at rounding, the
-energy may rise by rounding (1e-5 and 1e-3 of what is dissipated), and positions are compared to 1e-3 of the length. On
+energy may rise by rounding (1e-4 and 1e-3 of what is dissipated), and positions are compared to 1e-3 of the length. On
 a GPU a factor's inverse has numbers of 16 bits ([factor_precision](../scenes.md#solver)), so that four times as many
 iterations are allowed where a number of them must hold."""
 RECIPES = """\
