@@ -205,8 +205,10 @@ def times(parts: Sequence[Row]) -> list[Row]:
         machine = head["machine"]
         where = machine["gpu"] if told["device"] == "gpu" else machine["cpu"]
         rows.append({
-            "run": f"{told['only']}; {told['precision']}", "on": f"{where}, {machine['cores']} cores",
-            "processes": told["jobs"], "runs of cases": len(part["rows"]), "wall time, s": f"{part['seconds']:.0f}",
+            "run": f"{told['only']}; {told['precision']}; {told['seeds']} seeds",
+            "on": f"{where}, {machine['cores']} cores",
+            "load": machine["load"], "processes": told["jobs"], "runs of cases": len(part["rows"]),
+            "wall time, s": f"{part['seconds']:.0f}",
             "sum of the cases, s": f"{part['wall']:.0f}", "left out": len(part["left_out"]), "commit": head["commit"],
         })  # fmt: skip
     return rows
@@ -274,6 +276,8 @@ def write_page(parts: list[Row], out: Path | None, quick: bool, report: Report |
         report.table(said)
     report.say(texts.TIMES)
     report.table(times(parts))
+    report.say(texts.EXTREMES)
+    report.table(texts.EXTREME_ROWS)
     if found.names("case"):
         _tell_cases(report, found)
     if names := found.names("effect"):

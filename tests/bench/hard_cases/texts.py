@@ -26,7 +26,7 @@ TIMES = """\
 ## Wall time
 
 Of each run of the bench that this page is made of, with start of processes and compilation; *sum of the cases*: of
-their own wall times, in processes beside each other."""
+their own wall times, in processes beside each other; *load*: of the machine by other work, at the start."""
 CASES = """\
 ## One bar, one law
 
@@ -75,3 +75,67 @@ LONG = """\
 A bar of four cells (tests/hard_cases/long_runs.py). *memory*: of the process, grown since a tenth of the run. *cost*:
 processor time of a step in the last tenth over that in the second.
 """
+EXTREMES = """\
+## What workers and clients may do at worst
+
+No runs of the tables below, but tests: the answer stays the same, or the message is refused by its reason."""
+EXTREME_ROWS = [
+    dict(zip(("what", "what happens", "tests"), row, strict=True))
+    for row in (
+        (
+            "a factor 1, 10, 100 or 1000 steps old",
+            "the same answer, more iterations",
+            "`tests/hard_cases/test_extremes.py`, *old factor* below",
+        ),
+        (
+            "a factor of another object",
+            "the same answer",
+            "`tests/hard_cases/test_extremes.py`",
+        ),
+        (
+            "a factor of -A",
+            "its pivots are turned: the same answer",
+            "`tests/hard_cases/test_extremes.py`",
+        ),
+        (
+            "a factor with one NaN, of half the size, of another epoch, of another job; bytes that are none",
+            "refused; the job ends, the last factor stays",
+            "`tests/system/test_hostile_answers.py`",
+        ),
+        (
+            "workers that are killed, stopped, slow; none ever",
+            "the last factor, or block Jacobi",
+            "`tests/faults/test_faults.py`, *no worker* below",
+        ),
+        (
+            "a push of 1e6 N; a force that is no number",
+            "refused: `max_force`, finite",
+            "`tests/hard_cases/test_extremes.py`",
+        ),
+        (
+            "a grab of 1e6 N",
+            "exerts what the object allows",
+            "`tests/hard_cases/test_extremes.py`",
+        ),
+        (
+            "a grab of a node without elements",
+            "refused: no free node",
+            "`tests/hard_cases/test_extremes.py`",
+        ),
+        (
+            "a parameter that jumps by 1e6",
+            "taken, and counted as work",
+            "*a stiffness that jumps by 1e6* below",
+        ),
+        (
+            "another `dt` while steps run",
+            "refused: it is of a new run",
+            "`tests/hard_cases/test_extremes.py`",
+        ),
+        (
+            "scenes, states and events at random",
+            "no error but those for users, finite numbers, true statuses, the same bits twice",
+            "`tests/hard_cases/test_random_scenes.py`",
+        ),
+    )
+]
