@@ -9,9 +9,7 @@ wrong is one table, too: [When things go wrong](../failures.md). A film of ten t
 [gallery](../gallery.md#hard-cases), and one of all that are known to fail.
 
 *n of m*: of m seeds n hold all of what must hold. In mixed and single precision (GPU) solves may end at rounding, the
-energy may rise by rounding (1e-4 and 1e-3 of what is dissipated), and positions are compared to 1e-3 of the length. On
-a GPU a factor's inverse has numbers of 16 bits ([factor_precision](../scenes.md#solver)), so that four times as many
-iterations are allowed where a number of them must hold."""
+energy may rise by rounding (1e-4 and 1e-3 of what is dissipated), and positions are compared to 1e-3 of the length."""
 RECIPES = """\
 ## All of it
 
@@ -139,3 +137,14 @@ EXTREME_ROWS = [
         ),
     )
 ]
+
+ON_A_GPU = {  # why cases do not hold there
+    "stiffness 1e6 side by side": "The inverse of a factor has numbers of 16 bits there (factor_precision), which such "
+    "a ratio does not bear well: two to four times as many iterations. The answer is the same.",
+    "struck by a tool": "The passes of contact around the crushed cube end before they are solved, and each such "
+    "step says so; on a CPU a few do. In single precision it runs away, is told and frozen. Why is not known.",
+    "stiffness 1e4: neo_hookean, regularized": "Energies of elements are of single precision there: those of a part 1e4 "
+    "times as stiff are known to less than what the soft one dissipates. All else holds.",
+    "inside out: corotational, patch": "It creeps back a little later.",
+    "inside out, symmetric mesh": "Rounding decides, and is another one there.",
+}
