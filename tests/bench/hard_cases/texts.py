@@ -143,8 +143,8 @@ ON_A_GPU = {  # why cases do not hold there
     "a ratio does not bear well: two to four times as many iterations. The answer is the same.",
     "struck by a tool": "The passes of contact around the crushed cube end before they are solved, and each such "
     "step says so; on a CPU a few do. In single precision it runs away, is told and frozen. Why is not known.",
-    "stiffness 1e4: neo_hookean, regularized": "Energies of elements are of single precision there: those of a part 1e4 "
-    "times as stiff are known to less than what the soft one dissipates. All else holds.",
+    "stiffness 1e4: neo_hookean, regularized": "Energies of elements are of single precision there: those of a part "
+    "1e4 times as stiff are known to less than what the soft one dissipates. All else holds.",
     "inside out: corotational, patch": "It creeps back a little later.",
     "inside out, symmetric mesh": "Rounding decides, and is another one there.",
 }
