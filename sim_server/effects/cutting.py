@@ -200,7 +200,9 @@ class Cutting(Effect):
         for body in self.bodies:
             listed = [e for e in effects.values() if e.name in body.effects and e.name != "fixed"]
             if wrong := [e.name for e in listed if not e.cuttable(body)]:
-                raise self._refusal(body, f"elements cannot be removed with the effect {wrong[0]}")
+                others = [b.name for b in w.bodies if b.elements != "linear" and wrong[0] in b.effects]
+                why = f', which object {others[0]!r} has, too: set its elements = "linear"' if others else ""
+                raise self._refusal(body, f"elements cannot be removed with the effect {wrong[0]}{why}")
             if body.effects["cutting"].spare:
                 self._check_splittable(body, [e for e in listed if e is not self], effects)
             tied = {a.object for a in w.attachments} | {a.to for a in w.attachments}

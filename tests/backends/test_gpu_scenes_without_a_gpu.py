@@ -13,6 +13,7 @@ from sim_server.backends.gpu.inverse.plan import plan
 from sim_server.backends.gpu.islands import OWN_SURFACES
 from sim_server.backends.gpu.newton import own_blocks
 from sim_server.checkpoint.content import capture
+from sim_server.errors import InputError
 from sim_server.explain.explanation import explain
 from sim_server.scene.model import Scene
 from sim_server.simulation import Simulation
@@ -388,6 +389,12 @@ def test_a_body_that_is_split_has_the_arrays_of_one_that_began_so(cupy, law, key
     assert np.array_equal(pcg, sim.engine.solver.params), "graphs keep their addresses"
     assert {"spawn", "note_splits"} <= {kernel for kernel, _ in cupy.calls}
     written_back(sim)
+
+
+def test_steps_by_the_factor_alone_of_a_body_that_may_be_cut_are_refused(cupy):
+    given = cut_table("corotational", integrator={"scheme": "ros2"}, solver={})
+    with pytest.raises(InputError, match="the scheme ros2 cannot go on with it on a GPU; allowed there: others"):
+        Simulation(Scene.model_validate(given, context={"folder": "."}), "gpu")
 
 
 def test_a_scene_with_attachments_and_springs_alone_is_built(cupy):
