@@ -114,11 +114,6 @@ class Cutting(Effect):
                 f"object {self.bodies[0].name!r}, effect cutting: pieces that come apart need inertia, which the "
                 "scheme quasi_static leaves out"
             )
-        if world.backend.name == "gpu" and world.forces_alone and not world.explicit:
-            raise InputError(
-                f"object {self.bodies[0].name!r}, effect cutting: the scheme ros2 cannot go on with it on a GPU; "
-                "allowed there: others, as backward_euler"
-            )
         n, masses = world.nodes, world.mass.copy()
         world.uncut_mass = masses
 

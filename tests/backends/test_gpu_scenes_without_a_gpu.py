@@ -13,7 +13,6 @@ from sim_server.backends.gpu.inverse.plan import plan
 from sim_server.backends.gpu.islands import OWN_SURFACES
 from sim_server.backends.gpu.newton import own_blocks
 from sim_server.checkpoint.content import capture
-from sim_server.errors import InputError
 from sim_server.explain.explanation import explain
 from sim_server.scene.model import Scene
 from sim_server.simulation import Simulation
@@ -391,10 +390,18 @@ def test_a_body_that_is_split_has_the_arrays_of_one_that_began_so(cupy, law, key
     written_back(sim)
 
 
-def test_steps_by_the_factor_alone_of_a_body_that_may_be_cut_are_refused(cupy):
-    given = cut_table("corotational", integrator={"scheme": "ros2"}, solver={})
-    with pytest.raises(InputError, match="the scheme ros2 cannot go on with it on a GPU; allowed there: others"):
-        Simulation(Scene.model_validate(given, context={"folder": "."}), "gpu")
+def test_steps_by_the_factor_alone_look_for_cuts_where_a_body_may_be_cut(cupy):
+    own = {}
+    for cuttable in (True, False):
+        given = cut_table("corotational", integrator={"scheme": "ros2"}, solver={"preconditioner": "cholesky"})
+        if not cuttable:
+            del given["object"][0]["effects"]["cutting"]
+        sim = Simulation(Scene.model_validate(given, context={"folder": "."}), "gpu")
+        own[cuttable] = sim.engine._stages._solve(0)
+        if cuttable:
+            known = sim.world.backend.known_twin(sim.cutting.changed_at)
+            assert own[True]["changed_at"] == known.data.ptr and known.dtype == np.float64
+    assert own[False]["changed_at"] == 0 and own[True]["clock"] != 0
 
 
 def test_a_scene_with_attachments_and_springs_alone_is_built(cupy):
