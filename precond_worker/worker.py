@@ -165,6 +165,9 @@ class Worker:
         analysis = self._analysis(job)
         values = job.values(self._connection.slots)
         assembler = self._assemblers.of(job.object, message.header.epoch) if job.positions else None
+        complete = job.method.name == "cholesky"  # its pattern is known beforehand
+        if complete:  # so that the server can prepare for it meanwhile
+            self._send_pattern(job, analysis.pattern)
         begin = time.perf_counter()
         if assembler is not None:
             values = assembler.matrix(values)
@@ -172,9 +175,14 @@ class Worker:
         factor = np.ascontiguousarray(analysis.factorize(values, np.dtype(message.factor_dtype)))
         seconds = time.perf_counter() - begin
         self._on_factorization(seconds)
-        if analysis.pattern.id not in message.known_patterns:
-            self._connection.send_pattern(analysis.pattern, job.object, message.header.epoch)
+        if not complete:
+            self._send_pattern(job, analysis.pattern)
         self._answer(job, analysis.pattern, factor, seconds, remedy=analysis.remedy)
+
+    def _send_pattern(self, job: Job, pattern: FactorPattern) -> None:
+        """Sends the pattern of L if the server does not know it."""
+        if pattern.id not in job.message.known_patterns:
+            self._connection.send_pattern(pattern, job.object, job.message.header.epoch)
 
     def _analysis(self, job: Job) -> Factorization:
         """Returns the symbolic phase, done once per epoch of an object."""

@@ -6,6 +6,8 @@ phase, which a change of topology waits for, takes a fraction of the time for th
 """
 
 from collections.abc import Callable
+from importlib import import_module
+from importlib.metadata import version
 
 import numpy as np
 from scipy.sparse import csc_matrix, csr_matrix
@@ -13,6 +15,9 @@ from scipy.sparse.linalg import splu
 
 from precond_worker.arrays import Int32, Int64
 from precond_worker.symbolic.blocks import rows_of
+from precond_worker.symbolic.order_cache import cached
+
+MODULES = {"pymetis": "pymetis", "scikit-sparse": "sksparse.cholmod"}
 
 
 def order_nodes(row_start: Int32, columns: Int32) -> Int64:
@@ -30,22 +35,21 @@ def order_nodes(row_start: Int32, columns: Int32) -> Int64:
     number = np.cumsum(degree > 0) - 1
     start = np.concatenate([[0], np.cumsum(degree[connected])]).astype(np.int32)
     neighbours = number[columns[coupled]].astype(np.int32)
-    return np.concatenate([alone, connected[fill_reducing()(start, neighbours)]])
+    order, name = fill_reducing()
+    return np.concatenate([alone, connected[cached(order, name, start, neighbours)]])
 
 
-def fill_reducing() -> Callable[[Int32, Int32], Int64]:
-    """Returns the best ordering that is installed, a function of adjacency lists without the nodes themselves."""
-    try:
-        import pymetis  # noqa: F401
-    except ImportError:
-        pass
-    else:
-        return metis_order
-    try:
-        import sksparse.cholmod  # noqa: F401
-    except ImportError:
-        return minimum_degree_order
-    return cholmod_order
+def fill_reducing() -> tuple[Callable[[Int32, Int32], Int64], str]:
+    """Returns the best ordering that is installed, a function of adjacency lists without the nodes themselves, and its
+    name with the version of the library."""
+    for package, order in (("pymetis", metis_order), ("scikit-sparse", cholmod_order)):
+        try:
+            found = version(package)
+            import_module(MODULES[package])
+        except ImportError:
+            continue
+        return order, f"{package} {found}"
+    return minimum_degree_order, f"scipy {version('scipy')}"
 
 
 def metis_order(start: Int32, neighbours: Int32) -> Int64:

@@ -237,11 +237,25 @@ class Engine(Protocol):
         ...
 
     def post_factor(self, body: int, pattern: FactorPattern, values: NDArray[Any], step: int) -> None:
-        """Copies a factor of the matrix of `step`; one of the next solves of the body takes it up."""
+        """Takes a factor of the matrix of `step`, whose values do not change any more; one of the next solves of the
+        body takes it up."""
+        ...
+
+    def prepare_for_factors(self) -> None:
+        """Begins what the first factor would wait for, without waiting."""
+        ...
+
+    def expect_factors(self, body: int, pattern: FactorPattern) -> None:
+        """Prepares for factors of a pattern that will come, without waiting."""
         ...
 
     def resume_factor(self, body: int, pattern: FactorPattern, values: NDArray[Any], step: int) -> None:
         """As `post_factor`, of the factor that was in use when the state that was written was saved."""
+        ...
+
+    @property
+    def substeps(self) -> int:
+        """Explicit substeps of the step under way, or of the last one; 0: an implicit scheme, or not known yet."""
         ...
 
     def settle_factors(self) -> None:

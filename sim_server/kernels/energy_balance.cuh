@@ -97,9 +97,14 @@ HOST_DEVICE void start_balance(Balance& b, const Sums& s, double size, double dt
     b.phase = WELL;
 }
 
-// Adds what a change of parameters adds to the elastic energy of a state; nothing if the law defines no energy there.
-HOST_DEVICE void add_work(Balance& b, double change) {
-    if (is_finite(change)) b.work += change;
+// Adds what a change of parameters adds to the elastic energy of a state; nothing if the law defines no energy there. Where the state
+// has more elastic energy than the budget, by errors of the time step, the budget falls in the same proportion as the energy: else what
+// is taken away could leave less than nothing, and the body, in which there is still some, would seem to run away. elastic: before [J]
+HOST_DEVICE void add_work(Balance& b, double change, double elastic) {
+    if (!is_finite(change)) return;
+    const double budget = b.start + b.work + b.fallen;
+    if (change < 0 && elastic > budget) change *= budget > 0 ? budget / elastic : 0;
+    b.work += change;
 }
 
 // Updates the balance after a step. True if the body is to be frozen now.

@@ -14,7 +14,7 @@ constexpr int POWER_ITERATIONS = 60;  // before the first step
 constexpr int FIRST_ITERATIONS = 68;  // with those that find the ratio of w^2 and q
 constexpr int ESTIMATE_EVERY = 8;     // substeps between two estimates of one iteration
 constexpr int RETRIES = 4;            // of a step that ran away: each halves the substeps
-constexpr int MOST_SUBSTEPS = 1 << 20;  // of the first step
+constexpr int MOST_SUBSTEPS = 1048576;  // of the first step
 constexpr int MOST_MORE = 16, MOST_AT_LEAST = 1024;  // a step has at most so many times those of the first step, or so many
 constexpr double SAFETY = 0.9;        // part of the stable step that a step begins with
 constexpr double LIMIT = 0.95;        // where the substep exceeds this part of it within a step the rest is made with SAFETY again

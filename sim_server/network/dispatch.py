@@ -11,7 +11,7 @@ import zenoh
 
 from protocol.channels import CHANNELS, key, name_in
 from protocol.counters import Counters
-from protocol.factor import Factor
+from protocol.factor import Factor, FactorPattern
 from protocol.messages_pb2 import Topology, WorkerInfo
 from protocol.refused import Refused
 from protocol.shared_memory.pool import Slot, SlotPool
@@ -30,6 +30,7 @@ log = logging.getLogger(__name__)
 
 TOKEN_QUERY_INTERVAL = 1.0  # s between queries for tokens of workers that send heartbeats without one
 FAST_SEND = 0.05  # s in which a fast link takes a job as bytes; zenoh drops what is not taken within 0.25 s
+MAX_NEW_PATTERNS = 256  # that wait to be prepared for; older ones are prepared for when their factors come
 SLOT_MARGIN = 8  # the slot for an incomplete factor is larger than the largest factor so far by a SLOT_MARGIN-th
 
 
@@ -67,6 +68,7 @@ class Dispatch(FactorSource):
         self._fast_links: set[str] = set()  # workers without shared memory whose link takes a job at once
         self._factors: list[Factor] = []
         self._failures: list[tuple[str, str]] = []
+        self._patterns: list[tuple[str, FactorPattern]] = []
         self._inbox = Inbox(session, server)
         self._token_query_due = 0.0
         self._on_message: dict[str, Callable[[zenoh.Sample], None]] = {
@@ -116,6 +118,13 @@ class Dispatch(FactorSource):
             self._receive()
             factors, self._factors = self._factors, []
             return factors
+
+    def patterns(self) -> list[tuple[str, FactorPattern]]:
+        """Returns (object, pattern) of the patterns that came since the last call; each comes before its factors."""
+        with self._lock:
+            self._receive()
+            patterns, self._patterns = self._patterns, []
+            return patterns
 
     def failures(self) -> list[tuple[str, str]]:
         """Returns (object, reason) of the jobs that failed, were refused, expired or were lost since the last call."""
@@ -360,7 +369,8 @@ class Dispatch(FactorSource):
             self._fail(job, f"was lost with worker {name}")
 
     def _on_pattern(self, sample: zenoh.Sample) -> None:
-        self._decoder.add_pattern(sample.key_expr, sample.payload)
+        if (new := self._decoder.add_pattern(sample.key_expr, sample.payload)) is not None:
+            self._patterns = [*self._patterns, new][-MAX_NEW_PATTERNS:]
 
     def _on_factor(self, sample: zenoh.Sample) -> None:
         message = self._decoder.parse_factor(sample.key_expr, sample.attachment)

@@ -47,18 +47,21 @@ class FactorDecoder:
         header = topology.header
         self.objects[header.object] = AnnouncedObject(header.epoch, 3 * topology.nodes, len(topology.columns) // 4)
 
-    def add_pattern(self, key: object, data: Sized) -> None:
-        """Keeps the pattern that a worker sends before its first factor with it."""
+    def add_pattern(self, key: object, data: Sized) -> tuple[str, FactorPattern] | None:
+        """Keeps the pattern that a worker sends before its first factor with it; returns it with its object if it is
+        new."""
         message = parse(PatternMessage, data, CHANNELS["pattern"].limit)
         known = self._object(message, key, "pattern")
         check_header(message, epoch=known.epoch)
         if message.size != known.size:
             raise Refused(f"FactorPattern.size is {message.size}; allowed: {known.size}", "shape")
         pattern = FactorPattern.from_message(message)
-        if pattern.id not in known.patterns:
-            while len(known.patterns) >= MAX_PATTERNS:
-                known.patterns.pop(next(iter(known.patterns)))
-            known.patterns[pattern.id] = pattern
+        if pattern.id in known.patterns:
+            return None
+        while len(known.patterns) >= MAX_PATTERNS:
+            known.patterns.pop(next(iter(known.patterns)))
+        known.patterns[pattern.id] = pattern
+        return message.header.object, pattern
 
     def parse_factor(self, key: object, attachment: Sized | None) -> FactorMessage:
         """Parses the message that travels with the values of a factor.

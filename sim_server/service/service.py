@@ -374,7 +374,8 @@ class Service:
         """Passes on new step records with what objects exerted on obstacles and others, readings, and new frames."""
         contact = self.telemetry.contact
         undone = [*contact.count_clipped(records), *contact.crowded_nodes(), *contact.broken_ties()]
-        for line in [*self.telemetry.count_unconverged(records), *self.telemetry.halved(records), *undone]:
+        told = [*self.telemetry.count_unconverged(records), *self.telemetry.halved(records)]
+        for line in [*told, *self.telemetry.many_substeps(), *undone]:
             log.warning("%s", line)
         for line in [*self.telemetry.count_runaways(records), *self.telemetry.not_finite(records)]:
             log.error("%s", line)

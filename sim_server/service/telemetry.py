@@ -41,6 +41,7 @@ STATUS_PERIOD = 1.0  # s
 LOOK_PERIOD = 0.02  # s between checks for subscribers
 MAX_BATCH = 4096  # step records sent together at most
 STATISTICS_STEPS = 1000  # last steps that percentiles and means are taken over
+MANY_SUBSTEPS = 10_000  # explicit ones of a step, of which it is told
 ENERGY_STEPS = 20  # steps between elastic energies in real time: one costs up to a fifth of a step
 
 
@@ -89,6 +90,7 @@ class Telemetry:
         self.runaways: Counter[int] = Counter()  # steps by body
         self.events = EventCounts()
         self._halved: set[int] = set()  # bodies of which it was said
+        self._told_substeps = False
         self._has_listeners = False
         self._due = {"steps": 0.0, "state": 0.0, "status": 0.0, "look": 0.0}
         self._has_viewers = False
@@ -409,6 +411,18 @@ class Telemetry:
                 )
         self.runaways.update(away["body"].tolist())
         return lines
+
+    def many_substeps(self) -> list[str]:
+        """Returns a line, once, if a step makes very many explicit substeps: while the first one is under way."""
+        count, dt = self.engine.substeps, self.simulation.world.dt
+        if self._told_substeps or count <= MANY_SUBSTEPS:
+            return []
+        self._told_substeps = True
+        return [
+            f"a step of dt = {dt:g} s takes {count:,} explicit substeps of {dt / count:.2g} s, each of which evaluates "
+            "all forces: the stiffest or smallest element allows none longer. What helps: softer material, no slivers, "
+            'or integrator.scheme = "backward_euler" or "ros2", which have no such limit'
+        ]
 
     def halved(self, records: NDArray[Any]) -> list[str]:
         """Returns a line for each object whose step was made again by short ones for the first time."""

@@ -63,6 +63,7 @@ class Driver:
         self.wants_factors = self.solver.wants_factors
         if self.wants_factors:
             self.check.prepare()
+            self.engine.prepare_for_factors()
         self.reactions: Float64 = np.zeros((0, 0, 6))
         self.other_reactions: NDArray[Any] = np.zeros(0, REACTION)
         self.readings: Float64 = np.zeros((0, 0))
@@ -172,7 +173,10 @@ class Driver:
     # --- factors in ---------------------------------------------------------------------------------------------
 
     def receive(self, source: FactorSource, on_factor: Callable[[Factor], None]) -> None:
-        """Passes on the factors that a source has made since the last call, and takes note of failed jobs."""
+        """Passes on the factors that a source has made since the last call, and takes note of failed jobs and of
+        patterns that factors will have."""
+        for name, pattern in source.patterns():
+            self.engine.expect_factors(self.by_name[name].body.index, pattern)
         for factor in source.poll():
             on_factor(factor)
         for name, reason in source.failures():

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
-from protocol.factor import Factor
+from protocol.factor import Factor, FactorPattern
 from protocol.method import Method
 from sim_server.arrays import Float64, Int32
 from sim_server.updates.patterns import Patterns
@@ -67,6 +67,10 @@ class FactorSource(Protocol):
     @abstractmethod
     def failures(self) -> list[tuple[str, str]]:
         """Returns (object, reason) of the jobs that ended without a factor since the last call."""
+
+    def patterns(self) -> list[tuple[str, FactorPattern]]:
+        """Returns (object, pattern) of the factors that will come, as far as it is new since the last call."""
+        return []
 
     def worker_count(self) -> int:
         """Number of workers that may be given jobs, idle or busy."""

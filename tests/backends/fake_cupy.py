@@ -200,7 +200,9 @@ def made(folder: Path, library: Any) -> ModuleType:
             getDeviceProperties=lambda number: properties, memcpyDeviceToDevice=3, memcpyHostToDevice=1,
             runtimeGetVersion=lambda: 13000, **memory,
         ),
-        Device=lambda *a: SimpleNamespace(id=0, compute_capability="90", attributes={"MultiProcessorCount": 132}),
+        Device=lambda *a: SimpleNamespace(
+            id=0, use=lambda: None, compute_capability="90", attributes={"MultiProcessorCount": 132}
+        ),
         Stream=Stream, get_current_stream=CurrentStream, memory=SimpleNamespace(OutOfMemoryError=MemoryError),
         alloc_pinned_memory=lambda size: np.zeros(max(size, 1), np.uint8),
         compiler=SimpleNamespace(CompileException=CompileException),

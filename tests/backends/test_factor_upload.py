@@ -2,8 +2,11 @@
 """Upload of factors to the GPU loop: two storages, none written while a step may read it; lack of memory."""
 
 import logging
+import threading
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
 from types import SimpleNamespace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
@@ -43,11 +46,21 @@ class Maker:
         self.storages: list[list[int]] = []
         self.events: list[Event] = []
         self.fail: Exception | None = None
+        self.thread = ThreadPoolExecutor(1)
+        self.planning: list[Future] | None = None  # plans that are not made yet; None: each is made at once
 
-    def inverse_builder(self, body: int, pattern: SimpleNamespace) -> "Maker":
+    def begin_plan(self, body: int, pattern: SimpleNamespace) -> Future:
+        made: Future = Future()
         if isinstance(self.fail, ValueError):
-            raise self.fail
-        return self
+            made.set_exception(self.fail)
+        elif self.planning is None:
+            made.set_result(SimpleNamespace(builder=self))
+        else:
+            self.planning.append(made)
+        return made
+
+    def beside(self, work: Callable[[], Any]) -> Future:
+        return self.thread.submit(work)
 
     def storage(self) -> list[int]:
         self.storages.append([])
@@ -147,6 +160,57 @@ def test_what_was_launched_with_a_factor_ends_before_its_storage_is_written_agai
     uploads.leaving = (uploads.in_use, scene.loop.step)
     upload.advance()
     assert [t[0] for t in maker.storages] == [3, 2]
+
+
+def test_nobody_waits_for_a_plan_and_the_newest_factor_wins(parts):
+    scene, maker, upload = parts
+    maker.planning = plans = []
+    for value in (5, 6, 7):
+        post(upload, value)
+        upload.advance()
+    scene.loop.run(1)  # goes without
+    assert len(plans) == 1 and maker.storages == [] and upload.step(0) == -1
+    maker.planning = None
+    plans[0].set_result(SimpleNamespace(builder=maker))
+    upload.settle()  # the first one is withdrawn, since another waits
+    scene.loop.run(1)
+    assert used(scene) == [0, 7] and upload.step(0) == 7
+
+
+def test_a_plan_that_fails_beside_the_caller_is_told_once(parts, caplog):
+    scene, maker, upload = parts
+    maker.planning = plans = []
+    post(upload, 5)
+    plans[0].set_exception(ValueError("not by nodes"))
+    with caplog.at_level(logging.WARNING):
+        upload.settle()
+    assert "not by nodes" in caplog.text and len(caplog.records) == 1
+    maker.planning = None
+    post(upload, 6)
+    upload.settle()
+    scene.loop.run(1)
+    assert used(scene) == [6]
+
+
+def test_large_factors_are_built_beside_the_caller(parts, monkeypatch):
+    scene, maker, upload = parts
+    monkeypatch.setattr(module, "SMALL", 0)
+    begun, callers = threading.Event(), []
+    build = maker.build
+
+    def slow(*arguments: Any) -> PartitionedInverse:
+        callers.append(threading.current_thread())
+        begun.wait(30)
+        return build(*arguments)
+
+    maker.build = slow
+    post(upload, 5)
+    post(upload, 6)
+    assert upload.step(0) == -1 and maker.storages in ([], [[]])  # it is under way
+    begun.set()
+    upload.settle()
+    scene.loop.run(1)
+    assert used(scene) == [6] and threading.current_thread() not in callers
 
 
 def test_plans_are_kept_of_the_last_two_patterns_alone(parts):

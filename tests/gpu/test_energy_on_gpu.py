@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from protocol.messages_pb2 import RUNAWAY
 from sim_server.effects.touch import Touch
 from sim_server.simulation import Simulation
+from tests.gpu.test_loads_on_gpu import made as loaded
 from tests.scenes import bar, scene
 from tests.state import put
 
@@ -88,6 +89,36 @@ def test_energies_in_other_precisions(precision):
         scale = np.abs(found["cpu"]["gravity"]).max(axis=0)
         assert (np.abs(found["gpu"][name] - found["cpu"][name]) <= 1e-3 * scale).all(), name
     assert (found["gpu"]["status"] != RUNAWAY).all()
+
+
+@pytest.mark.parametrize("precision", ["float64", "mixed", "float32"])
+@pytest.mark.parametrize("name", ["cable", "membrane", "rod", "target"])
+def test_energies_of_loads_are_summed_in_the_type_that_they_have(tmp_path, name, precision):
+    """A kernel writes them as `real` or as `local`, which differ in mixed precision."""
+    found = {}
+    for device, chosen in (("gpu", precision), ("cpu", "float64")):
+        sim = loaded(tmp_path, [name], device, precision=chosen, preconditioner="block_jacobi")
+        sim.engine.loop.energy_every = 1
+        sim.engine.run(5)
+        found[device] = sim.engine.records()
+    assert (found["gpu"]["status"] != RUNAWAY).all()
+    for column in ("elastic", "budget"):
+        scale = np.abs(found["cpu"][column]).max() + np.abs(found["cpu"]["gravity"]).max() * 1e-2
+        assert np.abs(found["gpu"][column] - found["cpu"][column]).max() <= 2e-3 * scale, column
+
+
+@pytest.mark.parametrize("precision", ["float64", "mixed", "float32"])
+def test_a_cable_that_is_drawn_in_does_not_run_away(precision):
+    """What the change of its length adds to the elastic energy is work."""
+    cable = {"path": [[0, 0.5, 0.5], [1, 0.5, 0.5], [2, 0.5, 0.5]], "stiffness": 2e4, "shortening": 0.0}
+    body = bar((4, 2, 2), (2, 1, 1), young=1e5, fixed="X < 0.01", damping=(5.0, 0.0))
+    body["effects"]["cable"] = cable
+    sim = Simulation(scene(body, dt=0.01, preconditioner="block_jacobi", precision=precision), "gpu")
+    for step in range(20):
+        sim.parameters.set({"bar.cable.shortening": f"{0.05 * step:g}"})
+        sim.engine.run(1)
+    records = sim.engine.records()
+    assert (records["status"] != RUNAWAY).all() and records["work"][-1] > 1
 
 
 def released(device: str, on_runaway: str, names: tuple[str, ...] = ("calm", "wild", "other")) -> Simulation:

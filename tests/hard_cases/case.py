@@ -49,6 +49,7 @@ class Case:
     upright: det F > 0 in every element at the end. refused: the model does not define the state: every solve ends with
     not_finite, an element is named, nothing moves, and put back to rest the body goes on. fails: known not to hold all
     of this; the statuses must tell. iterations: largest allowed mean over the steps with a factor.
+    seed: of running.seeded. saddle: where it goes is decided by rounding, so that other seeds may end elsewhere.
     note: what must be known to read the line; where something does not hold, why.
     """
 
@@ -70,6 +71,8 @@ class Case:
     refused: bool = False
     fails: bool = False
     iterations: float = 0
+    seed: int = 0
+    saddle: bool = False
     note: str = ""
 
     def must_hold(self) -> str:

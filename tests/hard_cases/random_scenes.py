@@ -152,7 +152,8 @@ def solvers(draw: Draw, scheme: str) -> Table:
     if scheme in ("ros2", "central_difference"):
         table["preconditioner"] = draw(st.sampled_from(("auto", "cholesky" if scheme == "ros2" else "none")))
     more: Table = {
-        "warm_start": False, "warp": False, "on_runaway": "go_on", "woodbury": draw(st.sampled_from((0, 1, 64))),
+        "warm_start": False, "warp": False, "on_runaway": draw(st.sampled_from(("go_on", "halve"))),
+        "woodbury": draw(st.sampled_from((0, 1, 64))),
         "projection": draw(st.sampled_from(("clamp", "absolute", "excess", "none"))), "factor_precision": "float64",
         "warp_level": 2, "omega": 1.5,
     }  # fmt: skip

@@ -16,7 +16,7 @@ from sim_server.effects.touch import TouchError
 from sim_server.parameters import BadParameter
 from sim_server.simulation import Simulation
 from sim_server.updates.driver import Driver
-from sim_server.updates.factor_source import Inline
+from sim_server.updates.factor_source import Inline, Job
 from tests.cutting.cut_scenes import cut, made
 from tests.scenes import bar, simulation
 
@@ -56,6 +56,22 @@ def test_the_factor_of_another_object_does_not_change_the_answer() -> None:
         return sim
 
     np.testing.assert_allclose(pair(True).world.x, pair(False).world.x, atol=1e-6 * 0.4)
+
+
+class Negated(Inline):
+    """Factorizes -A, which is not positive definite."""
+
+    def submit(self, job: Job) -> bool:
+        return super().submit(replace(job, values=-job.values))
+
+
+def test_the_factor_of_the_negated_matrix_does_not_change_the_answer() -> None:
+    """Every pivot is turned: that is a factor of A again, or none."""
+    sim = simulation(bar(**BAR), gravity=DOWN, update="lockstep-2", preconditioner="cholesky", tolerance=1e-8)
+    source = Negated({b.name: sim.system.body_pattern(b.first, b.last) for b in sim.world.bodies})
+    assert (Driver(sim, source).advance(STEPS)["status"] == 0).all()
+    exact = moved("never", preconditioner="block_jacobi")
+    np.testing.assert_allclose(sim.world.x, exact, atol=1e-6 * 0.4)
 
 
 @pytest.mark.parametrize("force", [(1e6, 0, 0), (math.nan, 0, 0), (math.inf, 0, 0)])

@@ -2,6 +2,7 @@
 """What the status says of records that nobody got, and how the client shows it."""
 
 import io
+from threading import Thread
 from types import SimpleNamespace
 
 import numpy as np
@@ -109,3 +110,28 @@ def test_the_client_shows_the_age_and_its_bound():
     Console(width=80, file=text).print(tables(pb.Status(objects=objects)))
     rows = {words[0]: words[-2:] for line in text.getvalue().splitlines() if (words := line.split())}
     assert (rows["liver"], rows["beam"]) == (["12/345", "block_jacobi"], ["0/-", "block_jacobi"])
+
+
+def test_very_many_explicit_substeps_are_told_once_while_the_first_step_is_made():
+    """A step of 1 s of a stiff cell takes hundreds of thousands: nobody waits for it without a word."""
+    body = bar((1, 1, 1), (0.01, 0.01, 0.01), young=1e9, fixed="X < 1e-4")
+    sim = simulation(body, dt=1.0, integrator={"scheme": "central_difference"})
+    telemetry = Telemetry(Driver(sim), SimpleNamespace(), None, patient=False)  # type: ignore[arg-type]
+    assert telemetry.many_substeps() == []  # not known yet
+    step, told = Thread(target=sim.engine.run, args=(1,)), []
+    step.start()
+    while not told and step.is_alive():
+        told = telemetry.many_substeps()
+    assert sim.engine.step == 0, "told after the step"
+    assert len(told) == 1 and f"{sim.engine.substeps:,} explicit substeps" in told[0]
+    assert telemetry.many_substeps() == []
+    sim.engine.loop.stop = 1
+    step.join()
+    assert sim.engine.records()["substeps"][0] == sim.engine.substeps > 100_000
+
+
+def test_few_explicit_substeps_are_not_told():
+    sim = simulation(bar(fixed="X < 0.01"), integrator={"scheme": "central_difference"})
+    telemetry = Telemetry(Driver(sim), SimpleNamespace(), None, patient=False)  # type: ignore[arg-type]
+    sim.engine.run(2)
+    assert sim.engine.substeps > 0 and telemetry.many_substeps() == []

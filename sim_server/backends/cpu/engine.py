@@ -701,12 +701,23 @@ class CpuEngine(Reports):
         self._mail[body].waiting = buffer
         self._native.wf_post_factor(c.byref(self._body[body]), buffer.address)
 
+    def prepare_for_factors(self) -> None:
+        """Does nothing."""
+
+    def expect_factors(self, body: int, pattern: FactorPattern) -> None:
+        """Does nothing: a factor is applied as it comes."""
+
     def resume_factor(self, body: int, pattern: FactorPattern, values: NDArray[Any], step: int) -> None:
         """Posts the factor that was in use when the state was saved; what is known of its correction holds."""
         self.post_factor(body, pattern, values, step)
         buffer = self._mail[body].waiting
         if self._corrects_resumed.get(body) and buffer is not None:
             self._body[body].correction.factor = buffer.address
+
+    @property
+    def substeps(self) -> int:
+        """Explicit substeps of the step under way, or of the last one; 0: an implicit scheme, or not known yet."""
+        return int(self._substeps.native.state.substeps) if self._substeps else 0
 
     def settle_factors(self) -> None:
         """Blocks until posted factors are in use. No-op on the CPU."""

@@ -29,6 +29,8 @@ THREADS: int = 128  # of a thread block: 32 WARPS of energy_balance.cu
 ROUND = 4  # substeps between two decisions
 FIRST_ITERATIONS: int = TEXT.constant("FIRST_ITERATIONS")
 ESTIMATE_EVERY: int = TEXT.constant("ESTIMATE_EVERY")
+MOST_SUBSTEPS: int = TEXT.constant("MOST_SUBSTEPS")
+SAFETY: float = TEXT.constant("SAFETY")
 
 
 class Branches(Protocol):
@@ -51,6 +53,8 @@ class SubstepLoop:
     readers: launches after the substeps
     energy: arguments of the energy balance (EnergyBalance)
     results: host memory (capacity, bodies) of SUBSTEP_RESULT that the steps write to
+
+    first: substeps of the first step; 0: not known yet
     """
 
     def __init__(
@@ -58,6 +62,7 @@ class SubstepLoop:
         readers: Sequence[DeviceLaunch], solver: PcgSolver, energy: NDArray[Any], dt: float, results: NDArray[Any],
     ):  # fmt: skip
         cp, self._device, self._given = gpu.cp, device, given
+        self._dt, self.first = dt, 0
         self._bodies = len(given.amplitude)
         self.close = cast(DeviceLaunch, given.close)
         others = [cast(DeviceLaunch, launch) for launch in given.launches]
@@ -104,6 +109,9 @@ class SubstepLoop:
         self._given.keep()
         for k in range(FIRST_ITERATIONS):
             self._iterate(k)
+        stable = self._memory["stable"].get().view(STABLE_STEP)
+        omega = float(stable["omega"].max(initial=0.0))
+        self.first = min(int(np.ceil(self._dt * omega / (2 * SAFETY))), MOST_SUBSTEPS)  # a few less than with damping
 
     def launch(self) -> None:
         """Appends a step, but for its end, while a graph is captured."""

@@ -45,6 +45,6 @@ extern "C" __global__ void __launch_bounds__(THREADS) elastic_energy(const Elast
 extern "C" __global__ void __launch_bounds__(THREADS) elastic_work(const ElasticWork p) {
     const int body = blockIdx.x * blockDim.x + threadIdx.x;
     if (body >= p.bodies) return;
-    if (p.after) add_work(p.balance[body], p.sum[body] - p.before[body]);
+    if (p.after) add_work(p.balance[body], p.sum[body] - p.before[body], p.before[body]);
     else p.before[body] = p.sum[body];
 }

@@ -69,12 +69,12 @@ class DeviceEnergies:
         self._params["on_runaway"] = CODES[e.on_runaway]
         self.prologue = Prologue(BALANCE_TEXT.checked(), "EnergyBalance", "balance_energy", self._params, len(chunks))
         self._balance_kernel = self._kernel(BALANCE_TEXT, "energy_balance")
-        self._elastic_kernel = self._kernel(ELASTIC_TEXT, "elastic_energy")
+        self._elastic_kernels = dict[np.dtype, KernelFunction]()  # by the type of the energies of an effect's elements
         self._launches = self._elastic(records)
 
-    def _kernel(self, text: Declarations, name: str) -> KernelFunction:
-        """Compiles the kernel of the text <name>.cu."""
-        flags = (*options(self._gpu.types), *own_headers())
+    def _kernel(self, text: Declarations, name: str, types: dict[str, str] | None = None) -> KernelFunction:
+        """Compiles the kernel of the text <name>.cu. types: of `real` and `local`, if other than the scene's"""
+        flags = (*options(types or self._gpu.types), *own_headers())
         module = self._gpu.cp.RawModule(code=text.checked(), options=flags, backend="nvrtc")
         return compiled(f"{name}.cu", module, name)
 
@@ -90,6 +90,9 @@ class DeviceEnergies:
             params["energy"], params["first_element"], params["sum"] = array.data.ptr, kept.data.ptr, self._sum.data.ptr
             params["step"], params["balance"] = self._counter.data.ptr, self._balance.data.ptr
             params["records"], params["capacity"], params["first_effect"] = records.ctypes.data, self._capacity, k == 0
+            if array.dtype not in self._elastic_kernels:
+                types = types_of_energies(self._gpu.types, array.dtype)
+                self._elastic_kernels[array.dtype] = self._kernel(ELASTIC_TEXT, "elastic_energy", types)
             made.append((launch, array, params))
         return made
 
@@ -110,10 +113,10 @@ class DeviceEnergies:
 
     def launch_elastic(self) -> None:
         """Launches the evaluation of the elastic energy of the last step, which is settled."""
-        for launch, _, params in self._launches:
+        for launch, array, params in self._launches:
             if launch is not None:
                 launch()
-            self._elastic_kernel((self._bodies,), (THREADS,), (params,))
+            self._elastic_kernels[array.dtype]((self._bodies,), (THREADS,), (params,))
 
     def prepare_work(self) -> None:
         """Allocates and compiles what `launch_work` needs."""
@@ -124,12 +127,12 @@ class DeviceEnergies:
 
     def launch_work(self, after: bool) -> None:
         """Launches what makes work of the elastic energy that a change of parameters adds. after: it is made."""
-        for launch, _, params in self._launches:
+        for launch, array, params in self._launches:
             if launch is not None:
                 launch()
             apart = params.copy()  # no record of a step tells of it
             apart["records"], apart["capacity"] = self._memory["scratch"].data.ptr, 1
-            self._elastic_kernel((self._bodies,), (THREADS,), (apart,))
+            self._elastic_kernels[array.dtype]((self._bodies,), (THREADS,), (apart,))
         work = np.zeros((), ELASTIC_WORK)
         work["sum"], work["before"] = self._sum.data.ptr, self._memory["before"].data.ptr
         work["balance"], work["bodies"], work["after"] = self._balance.data.ptr, self._bodies, after
@@ -162,6 +165,12 @@ class DeviceEnergies:
             library().wf_gpu_start_balance(row.ctypes.data, sums.ctypes.data, self._dt, int(e.inertia))
         self._balance.set(np.frombuffer(balance.tobytes(), np.uint8))
         self.started = True
+
+
+def types_of_energies(types: dict[str, str], energy: np.dtype) -> dict[str, str]:
+    """Returns the types by which elastic_energy.cu sums the energies of an effect: kernels write them as `local` or as
+    `real`, which differ in mixed precision. types: of the scene (device.PRECISIONS)"""
+    return types | {"local": "float" if energy == np.float32 else "double"}
 
 
 def node_chunks(starts: Int32, nodes: int) -> NDArray[Any]:

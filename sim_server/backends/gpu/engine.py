@@ -457,9 +457,23 @@ class GpuEngine(DeviceLoop):
         """Builds the inverse of a factor beside the steps; it is used from the first batch after its completion on."""
         self._factor_upload.post(body, pattern, values, step)
 
+    def prepare_for_factors(self) -> None:
+        """Has the kernels that build inverses of factors compiled beside the caller."""
+        self.solver.compile_builder()
+
+    def expect_factors(self, body: int, pattern: FactorPattern) -> None:
+        """Begins to plan the inverses of factors of a pattern that will come, beside the caller."""
+        self._factor_upload.expect(body, pattern)
+
     def resume_factor(self, body: int, pattern: FactorPattern, values: NDArray[Any], step: int) -> None:
         """Posts the factor that was in use when the state was saved."""
         self._factor_upload.post(body, pattern, values, step)
+
+    @property
+    def substeps(self) -> int:
+        """Explicit substeps of the first step; 0: an implicit scheme, or not known yet. Those of later ones are in the
+        records."""
+        return self._substeps.first if self._substeps else 0
 
     def settle_factors(self) -> None:
         """Blocks until the next solve will use the posted factors (deterministic policies)."""

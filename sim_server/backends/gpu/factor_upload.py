@@ -2,13 +2,17 @@
 """Upload of factors: a partitioned inverse is built beside the steps, then posted into the mailbox of the body.
 
 Each body has two storages per pattern (double buffering). A build begins once the inverse before it is in use and no
-step under way reads the other storage. A factor that arrives earlier is queued; a newer one replaces it.
+step under way reads the other storage. A factor that arrives earlier is queued; a newer one replaces it. Plans, made
+once per pattern, and the copies of large factors are left to a thread (PcgSolver.beside), for which the thread that
+serves the loop does not wait.
 """
 
 import logging
 import threading
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future, wait
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any, NamedTuple
 
 from numpy.typing import NDArray
@@ -19,10 +23,11 @@ from sim_server.backends.gpu.device import Gpu, no_memory_left
 from sim_server.backends.gpu.inverse.build_inverse import InverseStorage, PartitionedInverse
 from sim_server.backends.gpu.loop import DeviceLoop
 from sim_server.backends.gpu.mailbox import DeviceMailbox
-from sim_server.backends.gpu.solver import SETTINGS_BYTES, PcgSolver
+from sim_server.backends.gpu.solver import SETTINGS_BYTES, PcgSolver, PlannedInverse
 
 log = logging.getLogger(__name__)
 
+SMALL = 1 << 20  # bytes of a factor that is copied at once
 MAX_PATTERNS = 2  # of a body at a time; workers with different libraries send different patterns
 
 
@@ -35,6 +40,14 @@ class UploadedFactor(NamedTuple):
     pattern: FactorPattern
 
 
+class GivenFactor(NamedTuple):
+    """A factor that came. Its values do not change any more."""
+
+    pattern: FactorPattern
+    values: NDArray[Any]
+    step: int
+
+
 @dataclass
 class BodyUploads:
     """Factors of one body.
@@ -42,7 +55,8 @@ class BodyUploads:
     storages: by id of the pattern
     leaving: the factor in use before, and the number of steps after whose completion no step reads it
     posted: not taken by the loop yet
-    queued: pattern, values and step of a factor that waits for a storage
+    building: in the thread of the plans, and the factor that it is of
+    queued: a factor that waits for a storage, or for that thread
     warned: True after the first factor that could not be used
     """
 
@@ -52,8 +66,20 @@ class BodyUploads:
     in_use: UploadedFactor | None = None
     leaving: tuple[UploadedFactor, int] | None = None
     posted: UploadedFactor | None = None
-    queued: tuple[FactorPattern, NDArray[Any], int] | None = None
+    building: tuple[Future[UploadedFactor], GivenFactor] | None = None
+    queued: GivenFactor | None = None
     warned: bool = False
+
+    @property
+    def free(self) -> bool:
+        """True if a build may begin: a storage is free, or will be made."""
+        return self.posted is None and self.leaving is None and self.building is None
+
+    @property
+    def patterns(self) -> set[int]:
+        """Ids of the patterns whose plans are needed."""
+        coming = [given for given in (self.queued, self.building and self.building[1]) if given]
+        return {*self.storages, *(given.pattern.id for given in coming)}
 
 
 class FactorUpload:
@@ -70,57 +96,68 @@ class FactorUpload:
         self._gpu, self._solver, self._loop = gpu, solver, loop
         self._uploads = [BodyUploads(name, box) for name, box in zip(names, mailboxes, strict=True)]
         self._lock = threading.RLock()
-        self._waiting: set[int] = set()  # bodies with a queued factor
+        self._waiting: set[int] = set()  # bodies with a queued factor, or one that is built
+
+    def expect(self, body: int, pattern: FactorPattern) -> None:
+        """Begins to plan the inverses of factors of a pattern, beside the caller."""
+        self._solver.begin_plan(body, pattern)
 
     def post(self, body: int, pattern: FactorPattern, values: NDArray[Any], step: int) -> None:
-        """Takes a factor: begins to build its inverse now, or once a storage is free."""
+        """Takes a factor: begins to build its inverse now, or once a storage is free.
+
+        Returns at once: what takes long, plans and large factors, is done beside the caller. The values must not change
+        any more.
+        """
         with self._lock:
             uploads = self._uploads[body]
-            self._refresh(uploads)
-            if uploads.posted is None and uploads.leaving is None:
-                self._begin(body, pattern, values, step)
-            else:
-                uploads.queued = (pattern, values.copy(), step)
-                self._waiting.add(body)
+            self._refresh(body)
+            uploads.queued = GivenFactor(pattern, values, step)
+            self._begin_queued(body)
 
     def advance(self) -> None:
-        """Begins the builds that have waited for a storage."""
+        """Posts what was built beside the caller, and begins the builds that have waited for a storage."""
         with self._lock:
             for body in sorted(self._waiting):
-                uploads = self._uploads[body]
-                self._refresh(uploads)
-                if uploads.posted is None and uploads.leaving is None:
-                    self._begin(body, *self._pop_queued(body))
+                self._refresh(body)
+                self._begin_queued(body)
 
     def settle(self) -> None:
         """Waits until the next step will use the newest factors. Only while the loop stands still."""
-        with self._lock:
-            for body, uploads in enumerate(self._uploads):
-                self._refresh(uploads)
-                if body in self._waiting:
-                    if uploads.posted is not None and uploads.mailbox.withdraw():
-                        uploads.posted.inverse.event.synchronize()  # its storage may be reused
-                        uploads.posted = None
-                    self._begin(body, *self._pop_queued(body))
-                if uploads.posted is not None:
-                    uploads.posted.inverse.event.synchronize()
+        for body in range(len(self._uploads)):
+            while (building := self._settled(body)) is not None:
+                wait([building])  # without the lock: the thread that serves the loop goes on
 
-    def _pop_queued(self, body: int) -> tuple[FactorPattern, NDArray[Any], int]:
-        self._waiting.discard(body)
-        uploads = self._uploads[body]
-        queued, uploads.queued = uploads.queued, None
-        assert queued is not None
-        return queued
+    def _settled(self, body: int) -> "Future[UploadedFactor] | None":
+        """Has the next step use the newest factor of a body; returns a build that must be waited for first."""
+        with self._lock:
+            uploads = self._uploads[body]
+            self._refresh(body)
+            if uploads.queued is not None and uploads.building is None:
+                if uploads.posted is not None and uploads.mailbox.withdraw():
+                    uploads.posted.inverse.event.synchronize()  # its storage may be reused
+                    uploads.posted = None
+                self._refresh(body)
+                uploads.leaving = None
+                self._begin_queued(body)
+            if uploads.building is not None:
+                return uploads.building[0]
+            if uploads.posted is not None:
+                uploads.posted.inverse.event.synchronize()
+            return None
 
     def step(self, body: int) -> int:
         """Returns the step of the factor in use, -1 without one."""
         with self._lock:
-            self._refresh(self._uploads[body])
+            self._refresh(body)
             factor = self._uploads[body].in_use
             return factor.step if factor else -1
 
-    def _refresh(self, uploads: BodyUploads) -> None:
-        """Updates the state of the factors: taken by the loop, out of use."""
+    def _refresh(self, body: int) -> None:
+        """Updates the state of the factors: built, taken by the loop, out of use."""
+        uploads = self._uploads[body]
+        if uploads.building is not None and uploads.building[0].done():
+            (future, given), uploads.building = uploads.building, None
+            self._finish(body, given.pattern, future.result)
         if uploads.posted is not None and uploads.mailbox.taken:
             if uploads.in_use is not None:  # steps launched until now may still read it
                 uploads.leaving = (uploads.in_use, int(self._loop.loop.launched))
@@ -128,10 +165,46 @@ class FactorUpload:
         if uploads.leaving is not None and self._loop.step >= uploads.leaving[1]:
             uploads.leaving = None
 
-    def _begin(self, body: int, pattern: FactorPattern, values: NDArray[Any], step: int) -> None:
+    def _begin_queued(self, body: int) -> None:
+        """Begins to build the queued factor, if there is one and it need not wait."""
+        uploads = self._uploads[body]
+        if uploads.queued is not None and uploads.free:
+            given, uploads.queued = uploads.queued, None
+            self._begin(body, given)
+        if uploads.queued is None and uploads.building is None:
+            self._waiting.discard(body)
+        else:
+            self._waiting.add(body)
+
+    def _begin(self, body: int, given: GivenFactor) -> None:
+        """Builds an inverse: at once if it is small and its plan is there, else in the thread of the plans."""
+        uploads = self._uploads[body]
+        plan = self._solver.begin_plan(body, given.pattern)
+        used = uploads.in_use.storage if uploads.in_use else None
+        spare = next((s for s in uploads.storages.get(given.pattern.id, []) if s is not used), None)
+        build = partial(self._build, plan, given, spare)
+        if plan.done() and given.values.nbytes <= SMALL:
+            self._finish(body, given.pattern, build)
+        else:
+            uploads.building = self._solver.beside(build), given
+
+    def _build(
+        self, plan: Future[PlannedInverse], given: GivenFactor, spare: InverseStorage | None
+    ) -> UploadedFactor:  # fmt: skip
+        """Begins to build an inverse in a storage, a new one unless there is one to spare. The plan is made."""
+        builder = plan.result().builder
+        storage = builder.storage() if spare is None else spare
+        self._gpu.cp.cuda.get_current_stream().synchronize()  # new arrays are complete for other streams
+        inverse = builder.build(given.values, storage, self._solver.spared)  # beside the steps
+        return UploadedFactor(inverse, storage, given.step, given.pattern)
+
+    def _finish(self, body: int, pattern: FactorPattern, build: Callable[[], UploadedFactor]) -> None:
+        """Posts the factor that `build` returns, or warns if it cannot be used."""
         uploads = self._uploads[body]
         try:
-            factor = self._build(body, pattern, values, step)
+            factor = build()
+            self._keep(uploads, factor)
+            self._solver.use(body, pattern, factor.inverse, factor.step)
         except (ValueError, CompileError) as error:
             self._warn(uploads, str(error))
             return
@@ -145,26 +218,18 @@ class FactorUpload:
         self._gpu.cp.cuda.get_current_stream().synchronize()  # arrays that `use` may have made are complete
         uploads.mailbox.post(row, keep=factor, event=factor.inverse.event.ptr)
 
-    def _build(self, body: int, pattern: FactorPattern, values: NDArray[Any], step: int) -> UploadedFactor:
-        uploads = self._uploads[body]
-        builder = self._solver.inverse_builder(body, pattern)
-        if pattern.id not in uploads.storages:
+    def _keep(self, uploads: BodyUploads, factor: UploadedFactor) -> None:
+        """Keeps the storage of a factor, and forgets those of patterns that are not used any more."""
+        if factor.pattern.id not in uploads.storages:
             in_use = uploads.in_use.pattern.id if uploads.in_use else None
             for old in [k for k in uploads.storages if k != in_use]:
                 if len(uploads.storages) >= MAX_PATTERNS:
                     del uploads.storages[old]
-            kept = {each for other in self._uploads for each in other.storages}
-            self._solver.forget_plans({*kept, pattern.id})
-        storages = uploads.storages.setdefault(pattern.id, [])
-        used = uploads.in_use.storage if uploads.in_use else None
-        storage = next((s for s in storages if s is not used), None)
-        if storage is None:
-            storage = builder.storage()
-            storages.append(storage)
-        self._gpu.cp.cuda.get_current_stream().synchronize()  # new arrays are complete for other streams
-        inverse = builder.build(values, storage, self._solver.spared)  # beside the steps
-        self._solver.use(body, pattern, inverse, step)
-        return UploadedFactor(inverse, storage, step, pattern)
+            kept = {each for other in self._uploads for each in other.patterns}
+            self._solver.forget_plans({*kept, factor.pattern.id})
+        storages = uploads.storages.setdefault(factor.pattern.id, [])
+        if all(storage is not factor.storage for storage in storages):
+            storages.append(factor.storage)
 
     def _warn(self, uploads: BodyUploads, reason: str) -> None:
         if not uploads.warned:

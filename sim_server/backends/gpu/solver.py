@@ -1,8 +1,11 @@
 # SPDX-License-Identifier: MIT
 """Memory and launch of the persistent conjugate gradient kernel (pcg.cu)."""
 
-from collections.abc import Collection, Mapping, Sequence
-from typing import Any
+import threading
+from collections.abc import Callable, Collection, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from functools import partial
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,16 +18,25 @@ from sim_server.backends.gpu.correction import FactorCorrection
 from sim_server.backends.gpu.cupy_types import DeviceArray, KernelFunction
 from sim_server.backends.gpu.device import Gpu, compiled, options, own_headers
 from sim_server.backends.gpu.followed_rows import FollowedRows
-from sim_server.backends.gpu.inverse.build_inverse import InverseBuilder, PartitionedInverse
+from sim_server.backends.gpu.inverse.build_inverse import InverseBuilder, PartitionedInverse, builder_kernels
 from sim_server.backends.gpu.inverse.device_plan import DevicePlan, shared_bytes
 from sim_server.backends.gpu.inverse.plan import plan
 from sim_server.backends.gpu.row_partition import SPARED, best_assignment, halo, initial_ranges, lists_of
 from sim_server.backends.gpu.structs import CONTACT, CORRECTION, PCG, PCG_RESULT, STAGES
 
+T = TypeVar("T")
+
 PCG_BODY = PCG.dtype("PcgBody")
 SETTINGS_BYTES = PCG_BODY.fields["factor_step"][1]  # type: ignore[index]
 """Bytes of a PCG_BODY before the factor: the settings."""
 PCG_ARGUMENTS, TRIAL_CLOCK = PCG.dtype("PcgArguments"), PCG.dtype("TrialClock")
+
+
+class PlannedInverse(NamedTuple):
+    """A plan of inverses on the device, and what builds them."""
+
+    plan: DevicePlan
+    builder: InverseBuilder
 
 
 def threads_and_blocks(nodes: Int64, processors: int) -> tuple[int, int]:
@@ -120,8 +132,10 @@ class PcgSolver:
         self._function = self._compiled("pcg", blocks)
         application = "apply_factor" if attempts else "island_factor" if between else None
         self._application = self._compiled(application, blocks) if application else None
-        self._plans: dict[tuple[int, int], DevicePlan] = {}  # by pattern and number of thread blocks
-        self._builders: dict[tuple[int, int], InverseBuilder] = {}  # likewise
+        self._device = cp.cuda.Device()
+        self._planner = ThreadPoolExecutor(1, "plans of inverses")
+        self._lock = threading.Lock()
+        self._plans: dict[tuple[int, int], Future[PlannedInverse]] = {}  # by pattern and number of thread blocks
         self._vectors: dict[tuple[int, int], dict[str, DeviceArray]] = {}  # by body and plan
         self._factor_bytes = [0] * len(ranges)
 
@@ -152,10 +166,10 @@ class PcgSolver:
 
     def forget_plans(self, patterns: Collection[int]) -> None:
         """Frees plans of factors of all but these patterns (FactorPattern.id), which no step may use any more."""
-        gone = [key for key in self._plans if key[0] not in patterns]
-        addresses = {self._plans[key].address for key in gone}
-        for key in gone:
-            del self._plans[key], self._builders[key]
+        with self._lock:
+            gone = [key for key, made in self._plans.items() if key[0] not in patterns and made.done()]
+            made = [self._plans.pop(key) for key in gone]
+        addresses = {each.result().plan.address for each in made if each.exception() is None}
         self._vectors = {key: made for key, made in self._vectors.items() if key[1] not in addresses}
 
     def _compiled(self, name: str, blocks: int) -> KernelFunction:
@@ -228,29 +242,53 @@ class PcgSolver:
         params["pool_counter"] += np.uint64(self.pool_counter.dtype.itemsize * number)
         function((self.grid,), (self.threads,), (params, stage), shared_mem=self._shared)
 
+    def compile_builder(self) -> None:
+        """Has the kernels that build inverses compiled beside the caller, before a factor waits for them."""
+        self.beside(lambda: builder_kernels(self.gpu))
+
+    def beside(self, work: Callable[[], T]) -> Future[T]:
+        """Has work done in the thread of the plans, one after another."""
+
+        def on_device() -> T:
+            self._device.use()  # the current device is one of each thread
+            return work()
+
+        return self._planner.submit(on_device)
+
+    def begin_plan(self, body: int, pattern: FactorPattern) -> Future[PlannedInverse]:
+        """Returns the plan of the inverse of factors of this pattern for a body, and its builder: at first, they are
+        made in a thread. Its result raises what `plan` raises."""
+        blocks = int(self.bodies[body]["blocks"])
+        key = (pattern.id, blocks)
+        with self._lock:
+            if key in self._plans:
+                return self._plans[key]
+            made = self._plans[key] = self.beside(lambda: self._planned(pattern, blocks))
+        made.add_done_callback(partial(self._forget_failed, key))
+        return made
+
+    def _forget_failed(self, key: tuple[int, int], made: Future[PlannedInverse]) -> None:
+        """Has a plan that could not be made tried again the next time: memory may be free then."""
+        if made.exception() is not None:
+            with self._lock:
+                if self._plans.get(key) is made:
+                    del self._plans[key]
+
+    def _planned(self, pattern: FactorPattern, blocks: int) -> PlannedInverse:
+        found = plan(pattern, blocks, planes=self.planes, shared=self._shared)
+        if (needed := shared_bytes(found)) > self._shared:
+            raise ValueError(
+                f"{pattern.size} degrees of freedom in {blocks} thread blocks need {needed} bytes of shared memory "
+                f"each, allowed: {self._shared}"
+            )
+        return PlannedInverse(DevicePlan(self.gpu, found, self.threads // 32), InverseBuilder(self.gpu, pattern, found))
+
     def plan(self, body: int, pattern: FactorPattern) -> DevicePlan:
-        """Returns the plan of the inverse of factors of this pattern for a body.
+        """Returns the plan of the inverse of factors of this pattern for a body; waits until it is made.
 
         Raises ValueError if the pattern has no plan (inverse.plan.plan) or needs more shared memory than there is.
         """
-        blocks = int(self.bodies[body]["blocks"])
-        key = (pattern.id, blocks)
-        if key not in self._plans:
-            found = plan(pattern, blocks, planes=self.planes, shared=self._shared)
-            if (needed := shared_bytes(found)) > self._shared:
-                raise ValueError(
-                    f"{pattern.size} degrees of freedom in {blocks} thread blocks need {needed} bytes of shared memory "
-                    f"each, allowed: {self._shared}"
-                )
-            device_plan = DevicePlan(self.gpu, found, self.threads // 32)
-            self._builders[key] = InverseBuilder(self.gpu, pattern, found)
-            self._plans[key] = device_plan  # only if there was memory for both
-        return self._plans[key]
-
-    def inverse_builder(self, body: int, pattern: FactorPattern) -> InverseBuilder:
-        """Returns the builder of inverses of factors of this pattern for a body. Raises ValueError as `plan` does."""
-        self.plan(body, pattern)
-        return self._builders[pattern.id, int(self.bodies[body]["blocks"])]
+        return self.begin_plan(body, pattern).result().plan
 
     def use(self, body: int, pattern: FactorPattern, inverse: PartitionedInverse, step: int) -> None:
         """Writes a factor into the host row of a body; it is in use once the row is uploaded."""

@@ -150,6 +150,10 @@ class Report:
         self._started = datetime.datetime.now().astimezone()
         self._machine, self._commit, self._before = machine(), commit(), calibration(quick)
 
+    def seconds(self) -> float:
+        """Wall time since it began [s]."""
+        return (datetime.datetime.now().astimezone() - self._started).total_seconds()
+
     def say(self, *paragraphs: str) -> None:
         """Adds paragraphs, tables, headings."""
         self._body += paragraphs

@@ -41,7 +41,7 @@ static void take_changes(Loop& loop) {
         for (int i = 0; i < loop.bodies; ++i) before[i] = loop.energies->balance[i].elastic;
         copy_all(loop, *next);
         measure_elastic(loop);
-        for (int i = 0; i < loop.bodies; ++i) add_work(loop.energies->balance[i], loop.energies->balance[i].elastic - before[i]);
+        for (int i = 0; i < loop.bodies; ++i) add_work(loop.energies->balance[i], loop.energies->balance[i].elastic - before[i], before[i]);
     } else {
         copy_all(loop, *next);
     }

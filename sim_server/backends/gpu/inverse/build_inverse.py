@@ -32,6 +32,11 @@ KERNELS: dict[str, Groups] = {
 }
 
 
+def builder_kernels(gpu: Gpu) -> dict[str, KernelFunction]:
+    """Returns the kernels of build_inverse.cu by name, compiled. Raises CompileError."""
+    return {name: gpu.module("backends/gpu/inverse/build_inverse.cu").function(name) for name in KERNELS}
+
+
 class PartitionedInverse(NamedTuple):
     """The inverse of a factor on the device.
 
@@ -66,9 +71,7 @@ class InverseBuilder:
         self._tasks = [[cp.asarray(t) for t in (b.diagonal, b.finish, *b.merges)] for b in layout.batches]
         self._workspace = workspace(cp.cuda.Device().id)
         self._workspace.reserve(layout.size, HEAD + 4 * self._nonzeros)
-        self._functions: dict[str, KernelFunction] = {
-            name: gpu.module("backends/gpu/inverse/build_inverse.cu").function(name) for name in KERNELS
-        }
+        self._functions = builder_kernels(gpu)
         self._graphs: dict[int | None, Graph] = {}
         self._generation = -1
         cp.cuda.get_current_stream().synchronize()  # the tables are there for the stream of builds, which does not wait
@@ -85,12 +88,18 @@ class InverseBuilder:
     ) -> PartitionedInverse:
         """Begins to build the inverse for the values (nonzeros,) of L; returns before it is complete.
 
-        Waits until the values of the build before have been copied to the device. Only one thread may call it.
+        Waits until the values of the build before have been copied to the device.
 
         storage: memory that nothing under way reads
         multiprocessors: largest number that the build keeps busy, for whole milliseconds; a launch that needs only the
             others runs beside it. None: all of them; a launch that needs all then waits some 100 us now and then.
         """
+        with self._workspace.lock:
+            return self._begin(values, storage, multiprocessors)
+
+    def _begin(
+        self, values: NDArray[np.floating], storage: InverseStorage, multiprocessors: int | None
+    ) -> PartitionedInverse:  # fmt: skip
         space, cp = self._workspace, self._gpu.cp
         if space.copied is not None:
             space.copied.synchronize()

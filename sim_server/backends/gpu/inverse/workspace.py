@@ -4,6 +4,7 @@
 Builds share it, since they run one after another on one stream of the lowest priority.
 """
 
+import threading
 from functools import cache
 from typing import Any
 
@@ -22,6 +23,7 @@ class Workspace:
     memory: device memory of the kernels
     generation: number of reallocations; graphs hold addresses of one generation
     copied: event after which `staging` may be written again
+    lock: held while memory is made or a build is begun, which several threads do
     """
 
     def __init__(self) -> None:
@@ -33,12 +35,17 @@ class Workspace:
         self._pinned: Any = None
         self.staging: NDArray[np.uint8] = np.zeros(0, np.uint8)
         self.copied: Event | None = None
+        self.lock = threading.Lock()
 
     def reserve(self, memory: int, incoming: int) -> None:
         """Enlarges the workspace to at least these numbers of bytes.
 
         Raises CuPy's error, and leaves the workspace as it is, if there is too little memory.
         """
+        with self.lock:
+            self._reserve(memory, incoming)
+
+    def _reserve(self, memory: int, incoming: int) -> None:
         cp = cupy()
         if memory <= self.memory.nbytes and incoming <= self.incoming.nbytes:
             return
