@@ -21,7 +21,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from clients.errors import BadInput, ClientError
-from clients.point_option import AT_HELP, PointCommand, point
+from clients.options.point import AT_HELP, PointCommand, point
+from clients.options.tls import TlsGroup
 from protocol.channels import DEFAULT_ENDPOINT, SERVER_NAME
 from protocol.log_pieces import size_of_log
 from protocol.network.endpoints import CONNECT
@@ -39,6 +40,7 @@ if TYPE_CHECKING:
 PROGRAM = Program("sim-client")
 app = typer.Typer(
     name="sim-client",
+    cls=TlsGroup,
     help="Look at a running sim-server, push its bodies about, view and export its logs.",
     no_args_is_help=True,
     rich_markup_mode=None,
@@ -864,6 +866,7 @@ def replay(
     listen: Annotated[
         list[str] | None, typer.Option(metavar="ENDPOINT", help=f"Where to be reached, {DEFAULT_ENDPOINT} by default.")
     ] = None,
+    insecure: Annotated[bool, typer.Option("--insecure", help="Let everybody in, also from other machines.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="For programs.")] = False,
 ) -> None:
     """Send a log out as if its server were live; or run it again and compare.
@@ -880,9 +883,9 @@ def replay(
     from clients.replay import command as replay_command
 
     if not simulate:
-        replay_command.republish(log, speed, loop, begin, end, name, connect, listen, as_json)
+        replay_command.republish(log, speed, loop, begin, end, name, connect, listen, as_json, insecure)
         return
-    if speed != "1" or loop or begin or end is not None or name or connect or listen:
+    if speed != "1" or loop or begin or end is not None or name or connect or listen or insecure:
         raise BadInput("replay: --simulate takes no other options than --json")
     raise typer.Exit(replay_command.simulate(log, as_json))
 

@@ -27,17 +27,21 @@ from clients.queries import Queries, read
 from clients.queries import send as send_query
 from clients.subscriptions import REACTIONS, Poses, States, Steps
 from protocol import messages_pb2 as pb
+from protocol.access.client_name import new_client
+from protocol.access.roles import may
 from protocol.channels import PROTOCOL, ROOT, SERVER_NAME, check_name, key
-from protocol.client_name import new_client
-from protocol.network.endpoints import BadEndpoint, usual_endpoints
-from protocol.network.session import ConnectionFailed, UnknownHost, open_session
+from protocol.network.endpoints import BadEndpoint, given_endpoints, usual_endpoints
+from protocol.network.identity import ROLES_FILE, usual_identity
+from protocol.network.session import ConnectionFailed, ConnectionRefused, UnknownHost, open_session
 from protocol.refused import Refused
 
 M = TypeVar("M", bound=Message)
 Point = Sequence[float]
 Value = float | bool | str | Sequence[Any]  # of a parameter; text is TOML
+KINDS = ("operator", "participant", "viewer")  # certificates that are taken from a folder with all of them, the first
 LONGEST_SAVE = 60.0  # s that a checkpoint takes to be made and sent, at most
 LONGEST_STEPS = 60.0  # s that a server takes to answer `step`, at most
+FRESH_STATUSES = 3  # times that a status with positions is asked for
 
 
 class Client:
@@ -45,26 +49,36 @@ class Client:
 
     connect: endpoints; by default those of the environment variable WARPFACTOR_CONNECT, or tcp/127.0.0.1:7447.
     timeout [s]: for connecting and for every answer; may be changed. secret: proves that commands are of this client.
-    Raises ClientError if there is no such server, BadInput for a bad name or endpoint.
+    tls: folder with a certificate, as `sim-server certs` makes it; by default that of WARPFACTOR_TLS, else none.
+    Raises ClientError if there is no such server or it refuses the certificate, BadInput for a bad name, endpoint or
+    folder.
 
     >>> with Client() as client:
     ...     client.push("beam", at="tip", force=(0, -50, 0), duration=0.2)
     """
 
-    def __init__(self, name: str = SERVER_NAME, connect: Sequence[str] | None = None, timeout: float = 3.0) -> None:
+    def __init__(
+        self, name: str = SERVER_NAME, connect: Sequence[str] | None = None, timeout: float = 3.0,
+        tls: str | Path | None = None,
+    ) -> None:  # fmt: skip
         self.name = name
-        self.id, self.secret = new_client()
         self.timeout = timeout
         self._numbers = itertools.count(1)  # of commands
         self._forces: Forces | None = None
+        self._rights: pb.Reply | None = None  # what this client may do; None: everything, without a certificate
         try:
             check_name(name, "server name")
-            connect = list(connect or usual_endpoints())
+            self.identity = usual_identity(tls, KINDS, connect or given_endpoints())
+            certified = self.identity is not None
+            self.id, self.secret = new_client(self.identity.name if self.identity else "")
+            connect = list(connect or usual_endpoints(certified))
             self._where = ", ".join(connect)
-            self._session = open_session("client", connect=connect, timeout=timeout, shared_memory=False)
+            self._session = open_session(
+                "client", connect=connect, timeout=timeout, shared_memory=False, tls=self.identity
+            )
         except (Refused, BadEndpoint) as error:
             raise BadInput(str(error)) from None
-        except UnknownHost as error:
+        except (UnknownHost, ConnectionRefused) as error:
             raise ClientError(str(error)) from None
         except ConnectionFailed:
             raise self._no_server() from None
@@ -72,6 +86,8 @@ class Client:
             self._queries = Queries(self._session.zenoh, name, self._where)
             self._token = self._session.zenoh.liveliness().declare_token(key("alive_client", name, client=self.id))
             self.status()
+            if self.identity is not None:
+                self._rights = self.command("rights")
         except BaseException:
             self.close()
             raise
@@ -81,12 +97,15 @@ class Client:
 
         fresh: of this moment, with the positions of the objects, unless the server has no time for that.
         """
-        if fresh:
-            with contextlib.suppress(BadInput, ClientError):
-                self.command("status")
-        found = self._query("status", pb.Status)
-        if not found:
-            raise self._no_server()
+        for _ in range(FRESH_STATUSES if fresh else 1):
+            if fresh:
+                with contextlib.suppress(BadInput, ClientError):
+                    self.command("status")
+            found = self._query("status", pb.Status)
+            if not found:
+                raise self._no_server()
+            if found[0].objects and found[0].objects[0].HasField("low"):
+                break  # else the status of each second, which has no positions, came between command and query
         return found[0]
 
     def scene(self) -> pb.Scene:
@@ -316,10 +335,15 @@ class Client:
 
     def _ask(self, command: pb.Command, timeout: float | None = None) -> pb.Reply:
         """Sends a command and waits for the reply, `self.timeout` unless told otherwise. Raises BadInput."""
+        self._check_right(command.verb)
         payload = command.SerializeToString()
-        found = self._queries.ask("command", pb.Reply, payload, self.timeout if timeout is None else timeout)
+        names = {"verb": command.verb, "client": self.id}
+        found = self._queries.ask(
+            "command", pb.Reply, payload, self.timeout if timeout is None else timeout, names=names
+        )
         if not found:
-            raise self._no_server()
+            there = self._queries.incarnation in self._queries.alive()
+            raise self._not_taken(command.verb) if there else self._no_server()
         if found[0].error:
             raise BadInput(f"{command.verb}: {found[0].error}")
         return found[0]
@@ -352,11 +376,12 @@ class Client:
             if not done_once:
                 answered(others[0] if others else None)
 
+        self._check_right(verb)
         try:
             command = self._command(verb, interaction, target)
             handler = zenoh.handlers.Callback(take, done)
-            payload = command.SerializeToString()
-            send_query(self._session.zenoh, self.name, "command", payload, self.timeout, handler)
+            payload, names = command.SerializeToString(), {"verb": verb, "client": self.id}
+            send_query(self._session.zenoh, self.name, "command", payload, self.timeout, handler, names)
             return command.header.sequence
         except zenoh.ZError as error:
             raise ClientError(f"lost the server {self.name!r} at {self._where}: {error}") from None
@@ -390,9 +415,31 @@ class Client:
     ) -> list[M]:  # fmt: skip
         return self._queries.ask(channel, kind, payload, self.timeout, complete)
 
+    def _check_right(self, verb: str) -> None:
+        """Raises BadInput if the role of this client's certificate does not have the verb."""
+        if self._rights is not None and verb not in self._rights.verbs:
+            assert self.identity is not None
+            raise BadInput(
+                f"{verb}: the certificate {self.identity.name!r} is that of a {self._rights.role}; "
+                f"{verb} is for {may(verb) or 'nobody'}"
+            )
+
+    def _not_taken(self, verb: str) -> ClientError:
+        """The server is there, but nobody takes this command."""
+        server = f"server {self.name!r} at {self._where}"
+        if self.identity is not None:
+            return ClientError(f"{verb}: access rules do not let {self.identity.name!r} through to {server}")
+        return ClientError(f"{verb}: {server} does not take this command; is it older than this client, or gone?")
+
     def _no_server(self) -> ClientError:
-        others = self._servers() if hasattr(self, "_session") else []
+        connected = hasattr(self, "_session")
+        others = self._servers() if connected else []
         there = f"; there is {', '.join(others)}" if others else "; is it running?"
+        if connected and self.identity is not None and (not others or repr(self.name) in others):
+            there = (
+                f" that answers the certificate {self.identity.name!r}: does {ROLES_FILE} of the server have it, with "
+                "the role of a client, and was the server started after it was made?"
+            )
         return ClientError(f"no server {self.name!r} at {self._where}{there}")
 
     def _servers(self) -> list[str]:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Any, Generic, TypeVar
@@ -31,13 +31,17 @@ MAX_SERVERS = 16  # incarnations whose answers are kept
 MAX_OBJECTS = 4096  # answers kept of an incarnation
 
 
-def send(session: zenoh.Session, server: str, channel: str, payload: bytes | None, timeout: float, handler: Any) -> Any:
+def send(
+    session: zenoh.Session, server: str, channel: str, payload: bytes | None, timeout: float, handler: Any,
+    names: Mapping[str, str] = {},
+) -> Any:  # fmt: skip
     """Queries everybody who answers under a key; returns zenoh's handler, which gets each reply as it comes.
 
+    names: parts of the key, as of `key`
     Without consolidation: by default zenoh holds the last reply of each key back until everybody has answered.
     """
     return session.get(
-        key(channel, server),
+        key(channel, server, **names),
         handler,
         payload=payload,
         timeout=timeout,
@@ -93,7 +97,7 @@ class Queries:
 
     def ask(
         self, channel: str, kind: type[M], payload: bytes | None, timeout: float,
-        complete: Callable[[list[M]], bool] = bool,
+        complete: Callable[[list[M]], bool] = bool, names: Mapping[str, str] = {},
     ) -> list[M]:  # fmt: skip
         """Returns the server's answers once `complete` accepts them, at the time-out those that came.
 
@@ -104,7 +108,7 @@ class Queries:
         end, settled, next_tokens = time.monotonic() + timeout + TOKEN_PERIOD, math.inf, 0.0
         try:
             channel_of_replies: zenoh.handlers.FifoChannel[zenoh.Reply] = zenoh.handlers.FifoChannel(MAX_REPLIES)
-            replies = send(self._session, self._name, channel, payload, timeout, channel_of_replies)
+            replies = send(self._session, self._name, channel, payload, timeout, channel_of_replies, names)
             while (reply := _next(replies, settled)) is not None:
                 who, now = found.take(reply, channel, kind), time.monotonic()
                 if who and who != self.incarnation:

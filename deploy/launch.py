@@ -22,6 +22,8 @@ import typer
 from protocol.network.endpoints import BadEndpoint, check_endpoint, on_this_machine
 from protocol.process.command_line import Program, Terminated, end_in_order
 from protocol.process.own_python import own_module
+from protocol.refused import Refused
+from sim_server.certificates.in_use import Certificates
 from sim_server.errors import InputError
 from sim_server.scene import Scene, load
 from sim_server.service.supervisor import Supervisor, worker_process
@@ -121,13 +123,13 @@ def environment_with(gpu: str | None) -> dict[str, str] | None:
 
 
 class Fleet:
-    """All servers and workers. Use it as a context manager: they end with it."""
+    """All servers and workers. Use it as a context manager: they end with it. host: with protocol, as tcp/127.0.0.1."""
 
     def __init__(self, scene: Scene, parts: Sequence[Part], host: str, port: int, record: Path | None, quiet: bool):
         self._scene, self._parts, self._record, self._quiet = scene, parts, record, quiet
         self._folder = tempfile.TemporaryDirectory(prefix="warpfactor-")
         self.names = [f"sim-{k}" for k in range(len(parts))]
-        self.listen = [f"tcp/{host}:{port + k}" for k in range(len(parts))]
+        self.listen = [f"{host}:{port + k}" for k in range(len(parts))]
         self.endpoints = [on_this_machine(endpoint) for endpoint in self.listen]
         self.gpus: list[str | None] = [None] * len(parts)  # of the servers
         self.worker_gpus: dict[str, str | None] = {}
@@ -235,25 +237,34 @@ def launch(
         list[str] | None,
         typer.Option("--set", metavar="KEY=VALUE|@FILE", help="Another value than the scene's, or a file of them"),
     ] = None,
+    tls: Annotated[
+        str | None, typer.Option(metavar="DIR", help="Ask for certificates; the folder that sim-server certs made")
+    ] = None,
+    insecure: Annotated[bool, typer.Option("--insecure", help="Let everybody in, also from other machines")] = False,
     json_: Annotated[bool, typer.Option("--json", help="Print what was started as JSON on one line")] = False,
 ) -> None:
     """Start N servers and M workers from one scene; its objects are distributed by size."""
     end_in_order()
+    protocol = "tcp" if tls is None else "tls"
     try:
         whole = load(scene, set_ or [])
         parts = distribute([len(o.load_mesh().tets) for o in whole.objects], servers)
-        check_endpoint(f"tcp/{host}:{port + len(parts) - 1}", listen=True)
+        last = check_endpoint(f"{protocol}/{host}:{port + len(parts) - 1}", listen=True)
+        Certificates(tls, [last], None, insecure, workers=workers > 0, web=False)
         if record:
             record.mkdir(parents=True, exist_ok=True)
-    except (InputError, BadEndpoint, OSError) as error:
+    except (InputError, BadEndpoint, Refused, OSError) as error:
         PROGRAM.bad_input(str(error))
     for_servers = ["--device", device, "--realtime" if realtime else "--free-run"]
     for_servers += ["--steps", str(steps)] if steps else []
+    for_servers += ["--tls", tls] if tls else []
+    for_servers += ["--insecure"] if insecure else []
     try:
-        with Fleet(whole, parts, host, port, record, json_) as fleet:
+        with Fleet(whole, parts, f"{protocol}/{host}", port, record, json_) as fleet:
             if "gpu" in (device, worker_device):
                 fleet.use_gpus(usable_gpus(os.environ), device == "gpu", workers if worker_device == "gpu" else 0)
-            fleet.start(workers, for_servers, ["--device", worker_device, "--threads", str(threads)])
+            of_workers = ["--tls", tls] if tls else []
+            fleet.start(workers, for_servers, ["--device", worker_device, "--threads", str(threads), *of_workers])
             say(fleet.describe(), servers, json_)
             raise typer.Exit(fleet.wait())
     except KeyboardInterrupt:

@@ -61,6 +61,12 @@ def work(
             metavar="NAME[@EP]", help="Server to work for, may be repeated; '*': every server found [default: sim]"
         ),
     ] = None,
+    tls: Annotated[
+        str | None,
+        typer.Option(
+            metavar="DIR", help="Folder of a certificate, as sim-server certs makes it [default: WARPFACTOR_TLS]"
+        ),
+    ] = None,
     metrics: Annotated[
         str | None,
         typer.Option(metavar="HOST:PORT", help="Serve metrics for Prometheus; PORT alone: of this machine"),
@@ -88,7 +94,7 @@ def work(
             die_with_parent(parent)
         library = chosen_library(device, precision)
         servers = ["sim"] if server is None else server
-        _serve(connect or [], threads, name or _default_name(), servers, not no_shared_memory, library, metrics)
+        _serve(connect or [], threads, name or _default_name(), servers, not no_shared_memory, library, tls, metrics)
     except NameTaken as error:
         PROGRAM.bad_input(str(error))
     except DeviceUnusable as error:
@@ -133,7 +139,7 @@ def chosen_library(device: str, precision: str) -> str:
 
 def _serve(
     connect: list[str], threads: int, name: str, servers: list[str], shared_memory: bool, library: str,
-    metrics: str | None,
+    tls: str | None, metrics: str | None,
 ) -> None:  # fmt: skip
     from contextlib import ExitStack
     from functools import partial
@@ -144,8 +150,11 @@ def _serve(
     from precond_worker.network.server_addresses import ServerAddress, server_addresses
     from precond_worker.network.server_connection import ServerConnection
     from precond_worker.worker import Worker
+    from protocol.access.roles import identity_in, own_name
     from protocol.channels import check_name
     from protocol.counters import Counters
+    from protocol.network.endpoints import given_endpoints
+    from protocol.network.identity import usual_identity
     from protocol.network.metrics_server import MetricsServer, metrics_address
     from protocol.network.session import Session
     from protocol.process.notify import Notifier
@@ -154,8 +163,12 @@ def _serve(
     end_in_order()
     notifier = Notifier.of_environment()
     try:
+        own = [server.partition("@")[2] for server in servers if "@" in server]
+        identity = usual_identity(tls, ("worker",), [*connect, *own] or given_endpoints())
+        if identity is not None and identity_in(name) != identity.name:
+            name = own_name(identity.name, name[len(identity.name) - 63 :])  # its end tells workers apart
         check_name(name, "--name")
-        where = server_addresses(servers, connect)
+        where = server_addresses(servers, connect, identity is not None)
         metrics_at = None if metrics is None else metrics_address(metrics)
     except ValueError as error:  # BadEndpoint or Refused
         PROGRAM.bad_input(str(error))
@@ -199,7 +212,7 @@ def _serve(
             collected.connections.remove(connected)
 
     with closing, MainLoop(
-        where, shared_memory, connection, worker, name, left, notifier.alive
+        where, shared_memory, connection, worker, identity, name, left, notifier.alive
     ) as serving:  # fmt: skip
         notifier.ready(f"{shown}, looking for {', '.join(servers)}")
         try:

@@ -15,6 +15,7 @@ from precond_worker.pool import Pool
 from precond_worker.round_robin import RoundRobin
 from precond_worker.worker import Worker
 from protocol.counters import Counters
+from protocol.network.identity import Identity
 from protocol.network.session import Session
 
 log = logging.getLogger(__name__)
@@ -48,6 +49,7 @@ class MainLoop:
         shared_memory: bool,
         connection: MakeConnection,
         worker: MakeWorker,
+        tls: Identity | None = None,
         name: str = "",
         left: Callable[[ServerConnection], None] = lambda connection: None,
         alive: Callable[[], None] = lambda: None,
@@ -60,7 +62,7 @@ class MainLoop:
         self._named: set[str] = set()
         self._pool_due = 0.0
         self._closing = ExitStack()
-        self._connector = Connector(addresses, shared_memory, self._round_robin.wake)
+        self._connector = Connector(addresses, shared_memory, self._round_robin.wake, tls)
         self._closing.callback(self._connector.close)
 
     def run(self) -> None:

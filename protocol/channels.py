@@ -50,12 +50,14 @@ CHANNELS: dict[str, Channel] = {
     "state": Channel("state/{object}", "State", "server", "at most 30 Hz", 256 * MIB, 0, "positions, velocities"),
     "obstacle": Channel("obstacle/{object}", "Obstacle", "server", "queryable", 256 * MIB, 0, "shape, where it starts"),
     "pose": Channel("pose/{object}", "ObstaclePose", "server", "at most 30 Hz", 4 * KIB, 0, "where it is now"),
-    "command": Channel("command", "Command", "client", "query", 64 * KIB, 0, "push, grab, pause, ..."),
-    "reply": Channel("command", "Reply", "server", "per command", MIB, 0, "what became of a command"),
+    "command": Channel("command/{verb}/{client}", "Command", "client", "query", 64 * KIB, 0, "push, grab, pause, ..."),
+    "reply": Channel("command/{verb}/{client}", "Reply", "server", "per command", MIB, 0, "what became of a command"),
     "alive_server": Channel("alive/server/{incarnation}", "", "server", "liveliness", 0, 0, "the server lives"),
     "alive_worker": Channel("alive/worker/{worker}", "", "worker", "liveliness", 0, 0, "a worker lives"),
     "alive_client": Channel("alive/client/{client}", "", "client", "liveliness", 0, 0, "a client lives"),
 }
+
+FORMER_COMMAND = "command"  # key of all verbs in older clients, which are told to be renewed
 
 _NAME = re.compile(r"[A-Za-z0-9_.-]{1,64}")
 
@@ -85,6 +87,11 @@ def key(channel: str, server: str = SERVER_NAME, **names: str) -> str:
     if server != "*":
         check_name(server, "server name")
     return f"{ROOT}/{server}/{template.format(**filled)}"
+
+
+def commands(server: str = SERVER_NAME) -> str:
+    """What the keys of all commands to a server begin with."""
+    return f"{ROOT}/{check_name(server, 'server name')}/command/"
 
 
 def everything(server: str = SERVER_NAME) -> str:

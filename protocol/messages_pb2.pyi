@@ -648,7 +648,7 @@ class Command(_message.Message):
     def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., client: _Optional[str] = ..., verb: _Optional[str] = ..., interaction: _Optional[_Union[Interaction, _Mapping]] = ..., secret: _Optional[bytes] = ..., target: _Optional[_Union[ObstacleTarget, _Mapping]] = ..., parameters: _Optional[_Iterable[_Union[Parameter, _Mapping]]] = ..., object: _Optional[str] = ..., steps: _Optional[int] = ..., worker: _Optional[str] = ..., cut: _Optional[_Union[Cut, _Mapping]] = ...) -> None: ...
 
 class Reply(_message.Message):
-    __slots__ = ("header", "error", "interaction", "status", "unchanged", "parameters", "worker", "removed", "left", "opened", "copied")
+    __slots__ = ("header", "error", "interaction", "status", "unchanged", "parameters", "worker", "removed", "left", "opened", "copied", "role", "verbs")
     HEADER_FIELD_NUMBER: _ClassVar[int]
     ERROR_FIELD_NUMBER: _ClassVar[int]
     INTERACTION_FIELD_NUMBER: _ClassVar[int]
@@ -660,6 +660,8 @@ class Reply(_message.Message):
     LEFT_FIELD_NUMBER: _ClassVar[int]
     OPENED_FIELD_NUMBER: _ClassVar[int]
     COPIED_FIELD_NUMBER: _ClassVar[int]
+    ROLE_FIELD_NUMBER: _ClassVar[int]
+    VERBS_FIELD_NUMBER: _ClassVar[int]
     header: Header
     error: str
     interaction: Interaction
@@ -671,7 +673,9 @@ class Reply(_message.Message):
     left: int
     opened: int
     copied: int
-    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., error: _Optional[str] = ..., interaction: _Optional[_Union[Interaction, _Mapping]] = ..., status: _Optional[_Union[Status, _Mapping]] = ..., unchanged: _Optional[bool] = ..., parameters: _Optional[_Iterable[_Union[LiveParameter, _Mapping]]] = ..., worker: _Optional[str] = ..., removed: _Optional[int] = ..., left: _Optional[int] = ..., opened: _Optional[int] = ..., copied: _Optional[int] = ...) -> None: ...
+    role: str
+    verbs: _containers.RepeatedScalarFieldContainer[str]
+    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., error: _Optional[str] = ..., interaction: _Optional[_Union[Interaction, _Mapping]] = ..., status: _Optional[_Union[Status, _Mapping]] = ..., unchanged: _Optional[bool] = ..., parameters: _Optional[_Iterable[_Union[LiveParameter, _Mapping]]] = ..., worker: _Optional[str] = ..., removed: _Optional[int] = ..., left: _Optional[int] = ..., opened: _Optional[int] = ..., copied: _Optional[int] = ..., role: _Optional[str] = ..., verbs: _Optional[_Iterable[str]] = ...) -> None: ...
 
 class Parameter(_message.Message):
     __slots__ = ("key", "value")

@@ -9,7 +9,9 @@ class Refused(ValueError):
 
     kind: by which receivers count refusals, one of
     malformed, version, incarnation, object, epoch, sequence, size, shape, not_finite, not_positive, checksum,
-    pattern, slot, late, duplicate, worker, limit, secret. Keys and values of the message are shown printable.
+    pattern, slot, late, duplicate, worker, limit, secret, role, key.
+
+    Keys and values of the message are shown printable.
     """
 
     def __init__(self, text: str, kind: str = "malformed"):

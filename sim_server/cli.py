@@ -13,9 +13,11 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from protocol.network.endpoints import default_endpoint
 from protocol.process.command_line import Program, Terminated, end_in_order
 from protocol.process.notify import Notifier
 from protocol.process.nvidia import nvidia_device
+from sim_server.certificates.in_use import Certificates
 from sim_server.errors import DeviceError, DeviceLost, InputError, NameTaken
 from sim_server.service.compile_notice import compile_notices
 from sim_server.service.web_page import WebCommand
@@ -37,8 +39,9 @@ Examples:
         with a page in the browser where it is dragged
   sim-server beam.toml --steps 500 --free-run --record beam.mcap
         as fast as it goes, with a log
-  sim-server beam.toml --listen tcp/0.0.0.0:7447
-        open to workers and clients on other machines
+  sim-server certs certs --host sim.example.org
+  sim-server beam.toml --tls certs --listen tls/0.0.0.0:7447
+        open to workers and clients on other machines that have certificates
   sim-server beam.toml --set solver.tolerance=1e-8 --set dt=0.01
         with other values than the scene's
   sim-server beam.toml --set @beam.plan.toml
@@ -130,6 +133,12 @@ def serve(
         str | None, typer.Option(metavar="SIZE", help="Refuse scenes that need more, by an estimate, as 4GB")
     ] = None,
     name: Annotated[str, typer.Option(metavar="NAME", help="Name of this server in all keys")] = "sim",
+    tls: Annotated[
+        str | None, typer.Option(metavar="DIR", help="Ask for certificates; the folder that sim-server certs made")
+    ] = None,
+    insecure: Annotated[
+        bool, typer.Option("--insecure", help="Let everybody in who reaches --listen, also from other machines")
+    ] = False,
     no_shared_memory: Annotated[bool, typer.Option("--no-shared-memory", help="Send arrays as bytes")] = False,
     quiet: Annotated[bool, typer.Option("--quiet", help="Say nothing but errors")] = False,
     explain: Annotated[
@@ -167,16 +176,16 @@ def serve(
     try:
         options = Options(
             scene, set_ or [], choose_device(device, say), name, listen, connect, not no_shared_memory, record, steps,
-            realtime, workers, worker_device, web, quiet, resume, metrics, record_rotate or [], record_keep,
-            max_objects, max_memory,
+            realtime, workers, worker_device, web, quiet, resume, tls, insecure, metrics, record_rotate or [],
+            record_keep, max_objects, max_memory,
         )  # fmt: skip
         with ExitStack() as closing:
             with nullcontext() if quiet else compile_notices(say):
                 service, supervisor = _set_up(closing, options)
             service.say = say
-            _announce(say, service, scene, listen)
+            _announce(say, service, scene, listen or [default_endpoint(tls is not None)])
             _wait_for_workers(service, supervisor)
-            _describe_objects(say, service, listen)
+            _describe_objects(say, service, listen, tls)
             service.health.notifier = notifier
             notifier.ready(f"{scene.name} on {', '.join(listen or ['loopback'])}")
             try:
@@ -255,6 +264,8 @@ class Options:
     web: str | None
     quiet: bool
     resume: Path | None
+    tls: str | None
+    insecure: bool
     metrics: str | None
     record_rotate: list[str]
     record_keep: str | None
@@ -264,8 +275,7 @@ class Options:
 
 def _set_up(closing: ExitStack, o: Options) -> "tuple[Service, Supervisor | None]":
     """Builds simulation, link, recorder and workers; exits with code 2 on bad input."""
-    from protocol.channels import DEFAULT_ENDPOINT
-    from protocol.network.endpoints import BadEndpoint, on_this_machine
+    from protocol.network.endpoints import BadEndpoint
     from protocol.network.exposure import unrestricted
     from protocol.network.metrics_server import metrics_address
     from protocol.network.session import AddressInUse, ConnectionFailed
@@ -283,6 +293,9 @@ def _set_up(closing: ExitStack, o: Options) -> "tuple[Service, Supervisor | None
 
     end_in_order()
     try:
+        certificates = Certificates(
+            o.tls, o.listen, o.connect, o.insecure, workers=o.workers > 0, web=o.web is not None
+        )
         page = _page_address(o.web)
         rotation = Rotation.of_options(o.record_rotate, o.record_keep)
         if (o.record_rotate or o.record_keep) and o.record is None:
@@ -291,7 +304,9 @@ def _set_up(closing: ExitStack, o: Options) -> "tuple[Service, Supervisor | None
         checkpoint = None if o.resume is None else read(o.resume)
         limits = SizeLimits.of_options(o.max_objects, o.max_memory)
         simulation = Simulation.load(o.scene, o.overrides, o.device, limits)
-        link = closing.enter_context(ServerLink(o.name, o.listen, o.connect, shared_memory=o.shared_memory))
+        link = closing.enter_context(
+            ServerLink(o.name, o.listen, o.connect, shared_memory=o.shared_memory, tls=certificates.server)
+        )
         recorder = None
         if o.record is not None:
             _check_log_path(o.record)
@@ -309,20 +324,22 @@ def _set_up(closing: ExitStack, o: Options) -> "tuple[Service, Supervisor | None
         PROGRAM.bad_input(f"{error}; is another sim-server there? --listen tcp/127.0.0.1:7448 takes another port")
     except (InputError, BadEndpoint, ConnectionFailed, Refused, CompileError) as error:
         PROGRAM.bad_input(str(error))
-    for endpoint in unrestricted(o.listen or []):
+    for endpoint in unrestricted([*(o.listen or []), *(o.connect or [])], o.tls is not None):
         logging.warning(
-            "--listen %s: anybody who reaches it may stop this server, and push, grab and pause; "
-            "docs/protocol.md (Security) tells how to restrict that", endpoint
+            "--insecure: %s: anybody who reaches it may stop this server, and push, grab and pause; docs/security.md "
+            "tells how to keep others out", endpoint
         )  # fmt: skip
     supervisor = None
     if o.workers and not simulation.scene.integrator.explicit:  # which needs none
-        endpoint = on_this_machine((o.listen or [DEFAULT_ENDPOINT])[0])
-        supervisor = Supervisor(o.workers, o.name, [endpoint], ["--device", o.worker_device])
+        endpoint = certificates.local_endpoint
+        of_workers = ["--device", o.worker_device, *certificates.for_worker]
+        if not link.shared_memory:  # which was told, once
+            of_workers.append("--no-shared-memory")
+        supervisor = Supervisor(o.workers, o.name, [endpoint], of_workers)
         closing.callback(supervisor.close)
         service.supervise(supervisor)
     if page is not None:
-        endpoint = on_this_machine((o.listen or [DEFAULT_ENDPOINT])[0])
-        web = WebPage(o.name, endpoint, *page, quiet=o.quiet)
+        web = WebPage(o.name, certificates.local_endpoint, *page, quiet=o.quiet, options=certificates.for_client)
         closing.callback(web.close)
         service.check_page = web.check
     return service, supervisor
@@ -360,19 +377,19 @@ def _check_log_path(path: Path) -> None:
                 raise InputError(f"--record {path}: this file exists and is no MCAP log; it is left as it is")
 
 
-def _announce(say, service: "Service", scene: Path, listen: list[str] | None) -> None:  # type: ignore[no-untyped-def]
-    from protocol.channels import DEFAULT_ENDPOINT
-
+def _announce(say, service: "Service", scene: Path, listen: list[str]) -> None:  # type: ignore[no-untyped-def]
     world, solver = service.simulation.world, service.simulation.scene.solver
     tets = sum(len(b.mesh.tets) for b in world.bodies)
     say(
         f"{scene.name}: {len(world.bodies)} object{'s' * (len(world.bodies) > 1)}, {world.nodes} nodes, {tets} tets, "
         f"dt {world.dt:g} s, preconditioner {solver.preconditioner}, update {solver.update}; {world.backend.name}; "
-        f"listening on {', '.join(listen or [DEFAULT_ENDPOINT])}"
+        f"listening on {', '.join(listen)}"
     )
 
 
-def _describe_objects(say, service: "Service", listen: list[str] | None) -> None:  # type: ignore[no-untyped-def]
+def _describe_objects(  # type: ignore[no-untyped-def]
+    say, service: "Service", listen: list[str] | None, tls: str | None
+) -> None:
     """Reports size and mass of each object, where a mesh in millimetres or a density in g/cm3 shows, and notes."""
     from sim_server.service.scene_notes import scene_notes
 
@@ -385,11 +402,11 @@ def _describe_objects(say, service: "Service", listen: list[str] | None) -> None
     if service.driver.wants_factors and service.driver.policy.free and not service.link.dispatch.workers():
         say(
             "no worker is there, so nothing makes factors and solves use block Jacobi; start one in a second terminal, "
-            f"{_worker_command(service.link.name, listen)}, or this server with --workers 1"
+            f"{_worker_command(service.link.name, listen, tls)}, or this server with --workers 1"
         )
 
 
-def _worker_command(name: str, listen: list[str] | None) -> str:
+def _worker_command(name: str, listen: list[str] | None, tls: str | None) -> str:
     """Returns the command that starts a worker for this server on this machine."""
     from protocol.channels import DEFAULT_ENDPOINT, SERVER_NAME
     from protocol.network.endpoints import on_this_machine
@@ -399,6 +416,8 @@ def _worker_command(name: str, listen: list[str] | None) -> str:
         words += ["--connect", on_this_machine(listen[0])]
     if name != SERVER_NAME:
         words += ["--server", name]
+    if tls is not None:
+        words += ["--tls", tls]
     return " ".join(words)
 
 
@@ -437,5 +456,11 @@ def _runaways(service: "Service") -> str:
 
 
 def main() -> None:
-    """Entry point of the console script."""
+    """Entry point of the console script. `certs` is a program of its own: SCENE.toml has no commands beside it."""
+    if sys.argv[1:2] == ["certs"]:
+        from sim_server.certificates import command
+
+        sys.argv[1:2] = []
+        command.PROGRAM.run(command.app)
+        return
     PROGRAM.run(app)

@@ -12,7 +12,8 @@ SMALL = ("protocol", "precond_worker", "clients")
 MOST_FILES = 12  # of a folder of theirs, without __init__.py
 PRIVATE_NAMES = 15  # that tests may use, fewer than
 ALLOWED = {  # what each folder imports of its package
-    "protocol.network": {"channels", "process", "refused", "shared_memory"},
+    "protocol.access": {"refused"},
+    "protocol.network": {"access", "channels", "process", "refused", "shared_memory"},
     "protocol.materials": set(),
     "protocol.process": set(),
     "protocol.shared_memory": {"channels", "refused", "validate"},
@@ -22,11 +23,13 @@ ALLOWED = {  # what each folder imports of its package
     "precond_worker.network": {"errors", "remote_assembly"},
     "clients.accuracy": {"errors", "load_test", "log", "progress", "watch"},
     "clients.demo": {"client", "errors", "load_test", "log"},
+    "clients.examples": {"client", "errors", "grab", "log"},
     "clients.export": {"client", "errors", "log", "viewer"},
     "clients.haptics": {"client", "errors", "obstacle"},
     "clients.log": {"errors"},
     "clients.identify": {"accuracy", "errors", "log", "plan", "progress"},
     "clients.materials": {"errors"},
+    "clients.options": {"errors"},
     "clients.web": {"client", "errors", "log", "viewer"},
     "clients.viewer": {"client", "errors", "log", "progress"},
     "clients.replay": {"errors", "log", "progress"},
@@ -35,8 +38,8 @@ ALLOWED = {  # what each folder imports of its package
 }
 ORDER = (  # of sim_server: each imports of those before it
     "errors", "arrays", "kernels", "mesh", "scene", "backends", "mechanics", "effects", "parameters", "simulation",
-    "state", "updates", "checkpoint", "network", "recording", "service", "explain", "replay", "embedded", "gym", "cli",
-    "__main__",
+    "state", "updates", "checkpoint", "network", "certificates", "recording", "service", "explain", "replay",
+    "embedded", "gym", "cli", "__main__",
 )  # fmt: skip
 REGISTRY = ("scene", "effects")  # a scene looks the names of effects up; the effects that it lists are imported later
 

@@ -13,8 +13,9 @@ import zenoh
 
 from clients.errors import BadInput, ClientError
 from protocol import messages_pb2 as pb
-from protocol.channels import CHANNELS, DEFAULT_ENDPOINT, PROTOCOL, check_name, everything, key
-from protocol.network.endpoints import BadEndpoint
+from protocol.channels import CHANNELS, PROTOCOL, check_name, commands, everything, key
+from protocol.network.endpoints import BadEndpoint, default_endpoint
+from protocol.network.exposure import check_exposure
 from protocol.network.session import ConnectionFailed, Session, open_session
 from protocol.refused import Refused
 from protocol.validate import check_header, parse
@@ -30,18 +31,21 @@ class ReplayServer:
 
     name: raises ClientError if it is taken; None: `otherwise`, with a suffix if that is taken. connect: endpoints of a
     router to join; listen: endpoints to listen on. Without both it listens on the default port, or joins the server
-    that does.
+    that does. insecure: other machines may reach it, though nothing keeps anybody out
     """
 
     def __init__(
-        self, name: str | None, otherwise: str, connect: Sequence[str] | None, listen: Sequence[str] | None
-    ) -> None:
+        self, name: str | None, otherwise: str, connect: Sequence[str] | None, listen: Sequence[str] | None,
+        insecure: bool = False,
+    ) -> None:  # fmt: skip
         self.incarnation = secrets.randbits(63) | 1
         self._sequence: Counter[str] = Counter()
         self._answers: dict[str, bytes] = {}
         self._commands: deque[zenoh.Query] = deque()
         try:
             wanted = check_name(otherwise if name is None else name, "server name")
+            if not insecure:
+                check_exposure(listen or [], [])
             self._session, self.where = _joined(connect, listen)
         except (Refused, BadEndpoint) as error:
             raise BadInput(str(error)) from None
@@ -84,7 +88,7 @@ class ReplayServer:
         """Answers one command."""
         self._stamp("reply", reply)
         try:
-            query.reply(key("command", self.name), reply.SerializeToString())
+            query.reply(query.key_expr, reply.SerializeToString())
         except zenoh.ZError as error:
             log.debug("a command was not answered: %s", error)
         finally:
@@ -120,7 +124,7 @@ class ReplayServer:
         return any(token.ok is not None for token in tokens)
 
     def _serve(self, query: zenoh.Query) -> None:
-        if str(query.key_expr) == key("command", self.name):
+        if str(query.key_expr).startswith(commands(self.name)):
             if len(self._commands) < MAX_COMMANDS:
                 self._commands.append(query)
             else:
@@ -139,10 +143,10 @@ def _joined(connect: Sequence[str] | None, listen: Sequence[str] | None) -> tupl
             return open_session("client", connect=connect, shared_memory=False), ", ".join(connect)
         try:
             session = open_session("server", listen=listen or None, connect=connect, shared_memory=False)
-            return session, ", ".join(listen or [DEFAULT_ENDPOINT])
+            return session, ", ".join(listen or [default_endpoint()])
         except ConnectionFailed:
             if listen:
                 raise
-            return open_session("client", connect=[DEFAULT_ENDPOINT], shared_memory=False), DEFAULT_ENDPOINT
+            return open_session("client", connect=[default_endpoint()], shared_memory=False), default_endpoint()
     except ConnectionFailed as error:
         raise ClientError(str(error)) from None

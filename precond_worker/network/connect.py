@@ -7,12 +7,15 @@ from collections import deque
 from collections.abc import Iterator, Sequence
 
 from precond_worker.network.server_addresses import ServerAddress
+from protocol.network.identity import Identity
 from protocol.network.session import ConnectionFailed, Session, open_session
 
 TIMEOUT = 1.0  # s of one attempt
 
 
-def connect_session(connect: Sequence[str], shared_memory: bool, ended: threading.Event | None = None) -> Session:
+def connect_session(
+    connect: Sequence[str], shared_memory: bool, ended: threading.Event | None = None, tls: Identity | None = None
+) -> Session:
     """Opens a session to the server; retries until it is there, and prints the first failure. Raises BadEndpoint.
 
     ended: set to give up, which raises the last ConnectionFailed.
@@ -20,7 +23,7 @@ def connect_session(connect: Sequence[str], shared_memory: bool, ended: threadin
     reported = False
     while True:
         try:
-            return open_session("client", connect=connect, shared_memory=shared_memory, timeout=TIMEOUT)
+            return open_session("client", connect=connect, shared_memory=shared_memory, timeout=TIMEOUT, tls=tls)
         except ConnectionFailed as failure:
             if ended is not None and ended.wait(0.05):
                 raise
@@ -32,8 +35,11 @@ def connect_session(connect: Sequence[str], shared_memory: bool, ended: threadin
 class Connector:
     """Connects to several addresses at once, each in a thread of its own; sets `wake` when one is reached."""
 
-    def __init__(self, addresses: Sequence[ServerAddress], shared_memory: bool, wake: threading.Event):
-        self._shared_memory, self._wake = shared_memory, wake
+    def __init__(
+        self, addresses: Sequence[ServerAddress], shared_memory: bool, wake: threading.Event,
+        tls: Identity | None = None,
+    ):  # fmt: skip
+        self._shared_memory, self._wake, self._tls = shared_memory, wake, tls
         self._ended = threading.Event()
         self._reached: deque[tuple[ServerAddress, Session]] = deque()
         self._sessions: list[Session] = []
@@ -43,7 +49,7 @@ class Connector:
 
     def _connect(self, address: ServerAddress) -> None:
         try:
-            session = connect_session(address.endpoints, self._shared_memory, self._ended)
+            session = connect_session(address.endpoints, self._shared_memory, self._ended, self._tls)
         except ConnectionFailed:
             return
         self._sessions.append(session)

@@ -21,20 +21,20 @@ class ServerAddress:
         return ", ".join(self.endpoints)
 
 
-def server_addresses(servers: Sequence[str], connect: Sequence[str]) -> list[ServerAddress]:
-    """Groups servers by endpoint; those without one have the endpoints of --connect.
+def server_addresses(servers: Sequence[str], connect: Sequence[str], certified: bool = False) -> list[ServerAddress]:
+    """Groups servers by endpoint; those without one have the endpoints of --connect. certified: with certificates.
 
     Raises BadEndpoint or Refused, both ValueErrors, that name the option.
     """
     for endpoint in connect:
-        check_endpoint(endpoint)
-    usual = tuple(connect) or tuple(usual_endpoints())
+        check_endpoint(endpoint, certified=certified)
+    usual = tuple(connect) or tuple(usual_endpoints(certified))
     names: dict[tuple[str, ...], list[str]] = {}
     for server in servers:
         name, at, endpoint = server.partition("@")
         if name != EVERY:
             check_name(name, "--server")
-        there = names.setdefault((check_endpoint(endpoint),) if at else usual, [])
+        there = names.setdefault((check_endpoint(endpoint, certified=certified),) if at else usual, [])
         if name in there:
             raise ValueError(f"--server {server} is given twice")
         there.append(name)

@@ -7,6 +7,7 @@ import re
 from protocol.channels import DEFAULT_ENDPOINT
 
 NETWORK = ("tcp", "udp", "tls", "quic", "ws")
+CERTIFIED = ("tls", "quic")  # protocols that ask for certificates
 LOCAL = ("unixsock-stream",)
 CONNECT = "WARPFACTOR_CONNECT"  # endpoints of the server, where none is given on the command line
 _ADDRESS = re.compile(r"(\[[0-9A-Fa-f:.%\w]+\]|[^:\s/\[\]]+):(\d{1,5})")
@@ -16,10 +17,20 @@ class BadEndpoint(ValueError):
     """An endpoint that cannot be used; the text says what is allowed."""
 
 
-def check_endpoint(endpoint: str, *, listen: bool = False) -> str:
-    """Returns the endpoint itself; raises BadEndpoint. Port 0 (any free one) is only for listening."""
+def default_endpoint(certified: bool = False) -> str:
+    """Returns where a server listens by default. certified: with certificates."""
+    return DEFAULT_ENDPOINT.replace("tcp/", "tls/") if certified else DEFAULT_ENDPOINT
+
+
+def check_endpoint(endpoint: str, *, listen: bool = False, certified: bool = False) -> str:
+    """Returns the endpoint itself; raises BadEndpoint. Port 0 (any free one) is only for listening.
+
+    certified: certificates are to be used, so that protocols without them are refused
+    """
     protocol, _, rest = endpoint.partition("/")
     address = re.split(r"[?#]", rest, maxsplit=1)[0]
+    if certified and protocol not in CERTIFIED and protocol in (*NETWORK, *LOCAL):
+        raise BadEndpoint(f"endpoint {endpoint!r} cannot be used with --tls; allowed: tls/HOST:PORT, quic/HOST:PORT")
     if protocol in LOCAL and address:
         return endpoint
     match = _ADDRESS.fullmatch(address)
@@ -32,11 +43,16 @@ def check_endpoint(endpoint: str, *, listen: bool = False) -> str:
     return endpoint
 
 
-def usual_endpoints() -> list[str]:
-    """Returns where workers and clients connect by default. Raises BadEndpoint."""
+def usual_endpoints(certified: bool = False) -> list[str]:
+    """Returns where workers and clients connect by default. Raises BadEndpoint. certified: with certificates."""
+    return given_endpoints() or [default_endpoint(certified)]
+
+
+def given_endpoints() -> list[str]:
+    """Returns the endpoints of WARPFACTOR_CONNECT. Raises BadEndpoint."""
     found = re.split(r"[,\s]+", os.environ.get(CONNECT, "").strip(", \t\n"))
     try:
-        return [check_endpoint(endpoint) for endpoint in found if endpoint] or [DEFAULT_ENDPOINT]
+        return [check_endpoint(endpoint) for endpoint in found if endpoint]
     except BadEndpoint as error:
         raise BadEndpoint(f"{CONNECT}: {error}") from None
 
@@ -51,3 +67,9 @@ def host_of(endpoint: str) -> str:
     protocol, _, rest = endpoint.partition("/")
     match = _ADDRESS.fullmatch(re.split(r"[?#]", rest, maxsplit=1)[0])
     return match.group(1).strip("[]") if match and protocol not in LOCAL else ""
+
+
+def port_of(endpoint: str) -> int:
+    """Returns the port of an endpoint; 0 if it has none (a path)."""
+    match = _ADDRESS.fullmatch(re.split(r"[?#]", endpoint.partition("/")[2], maxsplit=1)[0])
+    return int(match.group(2)) if match else 0

@@ -7,20 +7,24 @@ import os
 import re
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import cache
 from typing import Any, Literal, Self
 
 import zenoh
 
-from protocol.channels import DEFAULT_ENDPOINT, everything
-from protocol.network.endpoints import BadEndpoint, check_endpoint, usual_endpoints
+from protocol.channels import everything
+from protocol.network.endpoints import BadEndpoint, check_endpoint, default_endpoint, usual_endpoints
 from protocol.network.hosts import unknown_hosts
+from protocol.network.identity import AUTHORITY, CERTIFICATE, KEY, Identity
+from protocol.network.refusals import why_refused
 from protocol.shared_memory import limits as shm_limits
 
 log = logging.getLogger(__name__)
 
 LINK_LEASE = 2000  # ms without a keep-alive after which a link is considered dead
+ACCEPT_TIMEOUT = 3000  # ms that a connection may take to become a session
+ACCEPT_PENDING = 4096  # connections that are no session yet; beyond that new ones wait
 EXTRA_CONFIG = "WARPFACTOR_ZENOH_CONFIG"  # JSON5 file: certificates, users, access control
 
 
@@ -30,6 +34,10 @@ class ConnectionFailed(Exception):
 
 class UnknownHost(ConnectionFailed):
     """A host name of an endpoint does not resolve."""
+
+
+class ConnectionRefused(ConnectionFailed):
+    """Somebody listens there, but one side does not accept the other: no TLS, or certificates that do not fit."""
 
 
 class AddressInUse(ConnectionFailed):
@@ -44,45 +52,53 @@ def open_session(
     shared_memory: bool = True,
     timeout: float = 2.0,
     name: str | None = None,
+    tls: Identity | None = None,
+    access: Mapping[str, Any] | None = None,
 ) -> "Session":
     """Opens a session: a server listens and routes messages between clients, a client connects.
 
     listen (server) and connect (client, unless WARPFACTOR_CONNECT is set) default to loopback, port 7447. timeout:
     seconds a client tries to connect. name: of the server; messages to it do not wait for other
-    receivers.
+    receivers. tls: certificate with which it shows itself, and the authority of those that it accepts. access: rules
+    by certificate, as zenoh has them.
     Raises BadEndpoint or ConnectionFailed.
     """
     server = role == "server"
-    listening = [DEFAULT_ENDPOINT] if server and listen is None else list(listen or [])
-    connecting = list(connect or []) or ([] if server else usual_endpoints())
+    certified = tls is not None
+    listening = [default_endpoint(certified)] if server and listen is None else list(listen or [])
+    connecting = list(connect or []) or ([] if server else usual_endpoints(certified))
     for endpoint in listening:
-        check_endpoint(endpoint, listen=True)
+        check_endpoint(endpoint, listen=True, certified=certified)
     for endpoint in connecting:
-        check_endpoint(endpoint)
+        check_endpoint(endpoint, certified=certified)
     shared_memory = shared_memory and _shared_memory_works()
     try:
         if server or len(connecting) == 1:
-            config = _config(server, listening, connecting, shared_memory, timeout)
+            config = _config(server, listening, connecting, shared_memory, timeout, tls)
             if name is not None:
                 _never_wait_for_others(config, name)
+            if access is not None:
+                config.insert_json5("access_control", json.dumps(access))
             return Session(zenoh.open(config), shared_memory)
-        return Session(_open_first(connecting, shared_memory, timeout), shared_memory)
+        return Session(_open_first(connecting, shared_memory, timeout, tls), shared_memory)
     except zenoh.ZError as error:
         where = f"listen on {', '.join(listening)}" if server else f"connect to {', '.join(connecting)}"
         if unknown := unknown_hosts(listening if server else connecting):
             names = ", ".join(repr(name) for name in unknown)
             raise UnknownHost(f"cannot {where}: the name {names} does not resolve") from error
         taken = server and ("in use" in str(error) or "acquire lock" in str(error))  # of a port, of a socket file
+        if not server and (why := why_refused(connecting, tls)):
+            raise ConnectionRefused(f"cannot {where}: {why}") from error
         failure = AddressInUse if taken else ConnectionFailed
         raise failure(f"cannot {where}: {_reason(error)}") from error
 
 
-def _open_first(connect: list[str], shared_memory: bool, timeout: float) -> zenoh.Session:
+def _open_first(connect: list[str], shared_memory: bool, timeout: float, tls: Identity | None) -> zenoh.Session:
     """Tries all endpoints in turn until one answers; with a time-out zenoh would try the first one only."""
     end = time.monotonic() + timeout
     while True:
         try:
-            return zenoh.open(_config(False, [], connect, shared_memory, 0))
+            return zenoh.open(_config(False, [], connect, shared_memory, 0, tls))
         except zenoh.ZError:
             if time.monotonic() >= end:
                 raise
@@ -92,7 +108,7 @@ def _open_first(connect: list[str], shared_memory: bool, timeout: float) -> zeno
 def _shared_memory_works() -> bool:
     obstacle = shm_limits.obstacle()
     if obstacle:
-        _warn_once(f"shared memory is off, arrays travel as bytes: {obstacle}")
+        _warn_once(f"shared memory is off, arrays travel as bytes, which is slower for large bodies: {obstacle}")
     return not obstacle
 
 
@@ -101,7 +117,9 @@ def _warn_once(text: str) -> None:
     log.warning(text)
 
 
-def _config(server: bool, listen: list[str], connect: list[str], shared_memory: bool, timeout: float) -> zenoh.Config:
+def _config(
+    server: bool, listen: list[str], connect: list[str], shared_memory: bool, timeout: float, tls: Identity | None
+) -> zenoh.Config:  # fmt: skip
     extra = os.environ.get(EXTRA_CONFIG)
     try:
         config = zenoh.Config.from_file(extra) if extra else zenoh.Config()
@@ -121,14 +139,33 @@ def _config(server: bool, listen: list[str], connect: list[str], shared_memory: 
         "scouting/delay": 0,
         "adminspace/enabled": False,
         "transport/link/tx/lease": LINK_LEASE,
+        "transport/unicast/accept_timeout": ACCEPT_TIMEOUT,
+        "transport/unicast/accept_pending": ACCEPT_PENDING,
         "transport/shared_memory/enabled": shared_memory,
         # Only the server's slots use shared memory. An implicit pool in each worker would stay mapped and locked
         # in the server for every worker that ever lived (eclipse-zenoh/zenoh issue 2787).
         "transport/shared_memory/transport_optimization/enabled": False,
     }
+    if tls is not None:
+        settings["transport/link/tls"] = _certificates(tls)
     for key, value in settings.items():
         config.insert_json5(key, json.dumps(value))
     return config
+
+
+def _certificates(tls: Identity) -> dict[str, Any]:
+    """Returns zenoh's settings of TLS: both sides show a certificate, and a link ends when that of one expires."""
+    own, private = tls.file(CERTIFICATE), tls.file(KEY)
+    return {
+        "root_ca_certificate": tls.file(AUTHORITY),
+        "enable_mtls": True,
+        "verify_name_on_connect": True,
+        "close_link_on_expiration": True,
+        "listen_certificate": own,
+        "listen_private_key": private,
+        "connect_certificate": own,
+        "connect_private_key": private,
+    }
 
 
 def _never_wait_for_others(config: zenoh.Config, name: str) -> None:

@@ -16,6 +16,7 @@ EXTRAS = {  # modules of each extra of pyproject.toml; a module of several stand
     "export": ("foxglove", "h5py", "imageio_ffmpeg", "pxr"),
     "gym": ("gymnasium",),
     "identify": ("optuna",),
+    "tls": ("cryptography",),
     "slurm": ("submitit",),
     "metrics": ("prometheus_client",),
 }

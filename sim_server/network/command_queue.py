@@ -35,13 +35,16 @@ class CommandQueue:
 
     A command over the rate limit of its client, or beyond the capacity, is refused and counted (commands_refused). A
     move is deferred instead: the newest move of each grab and obstacle waits until the limit admits it and answers for
-    those before it (moves_replaced), so that what stops moving ends where it stopped.
+    those before it (moves_replaced), so that what stops moving ends where it stopped. account: says whose rate limit a
+    client has.
     """
 
     def __init__(
         self, counters: Counters, limiter: RateLimiter | None = None, capacity: int = CAPACITY,
         clock: Callable[[], float] = time.monotonic, moves: MoveLimiter | None = None,
+        account: Callable[[str], str] = str,
     ):  # fmt: skip
+        self._account = account
         self._counters, self._capacity, self._clock = counters, capacity, clock
         self._limiter = RateLimiter() if limiter is None else limiter
         self._moves = MoveLimiter(self._limiter) if moves is None else moves
@@ -67,7 +70,7 @@ class CommandQueue:
             for key in list(self._deferred):
                 if len(self._queue) >= self._capacity:
                     break
-                if self._moves.allow(self._deferred[key][0].client, now):
+                if self._moves.allow(self._account(self._deferred[key][0].client), now):
                     self._queue[key] = self._deferred.pop(key)
             taken = list(self._queue.values())
             self._queue.clear()
@@ -98,5 +101,5 @@ class CommandQueue:
 
     def _admits(self, command: Command, moves: bool, debt: float) -> bool:
         """Takes a token for the command; False if the client has none left."""
-        now = self._clock()
-        return self._moves.allow(command.client, now) if moves else self._limiter.allow(command.client, now, debt)
+        now, client = self._clock(), self._account(command.client)
+        return self._moves.allow(client, now) if moves else self._limiter.allow(client, now, debt)

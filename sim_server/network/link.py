@@ -31,14 +31,17 @@ from protocol.messages_pb2 import (
     Steps,
     Topology,
 )
+from protocol.network.identity import Identity, roles_of
 from protocol.network.session import open_session
 from protocol.refused import Refused
 from protocol.shared_memory.limits import POOL_LIMIT
 from protocol.shared_memory.pool import Slot, SlotPool, SlotsUnusable
+from sim_server.network.access_rules import access_rules
 from sim_server.network.dispatch import Dispatch
 from sim_server.network.name_claim import NameClaim
 from sim_server.network.publishers import Publishers
 from sim_server.network.queryables import Queryables
+from sim_server.network.rights import Rights
 from sim_server.network.send_queue import SendQueue
 
 log = logging.getLogger(__name__)
@@ -59,6 +62,7 @@ class ServerLink:
     listen: endpoints; loopback if None
     connect: other servers to be linked with
     slots: bytes of shared memory for matrices and factors
+    tls: certificate; roles of others are read beside it. None: none is asked for
     silence: seconds without a heartbeat until a worker gets no more jobs
     clock: monotonic time [s]
 
@@ -74,6 +78,7 @@ class ServerLink:
         *,
         shared_memory: bool = True,
         slots: int = POOL_LIMIT,
+        tls: Identity | None = None,
         silence: float = 2.0,
         clock: Callable[[], float] = time.monotonic,
     ):
@@ -81,12 +86,15 @@ class ServerLink:
         self.incarnation = secrets.randbits(63) | 1
         self.counters = Counters(log)
         self.local_workers: Callable[[], list[LocalWorker]] = list
+        roles = None if tls is None else roles_of(tls)
+        self._rights = Rights(roles)
         with ExitStack() as closing:
             self._session = open_session(
-                "server", listen=listen, connect=connect, shared_memory=shared_memory, name=self.name
-            )
+                "server", listen=listen, connect=connect, shared_memory=shared_memory, name=self.name, tls=tls,
+                access=None if roles is None else access_rules([self.name], roles),
+            )  # fmt: skip
             closing.callback(self._session.close)
-            self._claim = NameClaim(self._session, self.name, self.incarnation, listen, connect, clock)
+            self._claim = NameClaim(self._session, self.name, self.incarnation, listen, connect, clock, tls)
             closing.callback(self._claim.close)
             self._pool, probe_slot = self._make_slots(slots)
             if self._pool is not None:
@@ -107,8 +115,9 @@ class ServerLink:
             session, self.name, self.incarnation, self._pool, self._job_queue, self.counters, silence, clock
         )
         self._queryables = Queryables(
-            self._session, self.name, self.incarnation, self.counters, probe_slot, self._reply_queue, self._claim
-        )
+            self._session, self.name, self.incarnation, self.counters, probe_slot, self._reply_queue, self._claim,
+            self._rights,
+        )  # fmt: skip
         self._publishers = Publishers(
             session, self.name, self._telemetry_queue, self._urgent_queue, self.counters, self._stamp
         )

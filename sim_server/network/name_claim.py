@@ -16,6 +16,7 @@ import zenoh
 
 from protocol.channels import DEFAULT_ENDPOINT, key
 from protocol.messages_pb2 import Echo
+from protocol.network.identity import Identity
 from protocol.network.session import ConnectionFailed, Session, open_session
 from protocol.shared_memory import probe as shm_probe
 from sim_server.errors import NameTaken
@@ -32,16 +33,17 @@ class NameClaim:
 
     Queries are sent by a client session to the servers in `connect`: a router does not forward them between servers.
 
-    listen, connect, clock: as of ServerLink
+    listen, connect, clock, tls: as of ServerLink
     """
 
     def __init__(
         self, session: Session, server: str, incarnation: int,
         listen: Sequence[str] | None, connect: Sequence[str] | None, clock: Callable[[], float] = time.monotonic,
+        tls: Identity | None = None,
     ):  # fmt: skip
         self._server, self._incarnation, self._clock = server, incarnation, clock
         self._where = ", ".join(connect or listen or [DEFAULT_ENDPOINT])
-        self._session, self._client = session, None if not connect else _client(connect)
+        self._session, self._client = session, None if not connect else _client(connect, tls)
         self._since = float("inf")  # time of the first check [s, monotonic]: setting up may take long before it
         self._queried = float("-inf")  # time of the last query
         self._token_seen = False  # of another server of the name
@@ -121,8 +123,8 @@ class NameClaim:
             client.close()
 
 
-def _client(connect: Sequence[str]) -> Session | None:
+def _client(connect: Sequence[str], tls: Identity | None) -> Session | None:
     try:
-        return open_session("client", connect=connect, shared_memory=False, timeout=CONNECT_TIMEOUT)
+        return open_session("client", connect=connect, shared_memory=False, timeout=CONNECT_TIMEOUT, tls=tls)
     except ConnectionFailed:
         return None

@@ -7,8 +7,8 @@ from functools import partial
 
 import zenoh
 
-from protocol.channels import CHANNELS, PROTOCOL, key, name_in
-from protocol.client_name import check_client
+from protocol.access.client_name import check_client
+from protocol.channels import CHANNELS, FORMER_COMMAND, PROTOCOL, ROOT, check_name, commands, key, name_in
 from protocol.counters import Counters
 from protocol.messages_pb2 import Command, Echo, Header, Reply
 from protocol.network.session import Session
@@ -19,6 +19,7 @@ from protocol.validate import check_header, check_numbers, check_strings, parse
 from sim_server.network.coalesce import coalesce_moves
 from sim_server.network.command_queue import CommandQueue, PendingCommand
 from sim_server.network.name_claim import NameClaim
+from sim_server.network.rights import Rights
 from sim_server.network.send_queue import SendQueue
 
 log = logging.getLogger(__name__)
@@ -27,6 +28,11 @@ MAX_QUERIES = 256  # queries of a channel that may wait for its thread; beyond t
 LONGEST_NAME = 64  # characters of the name of an obstacle
 MAX_WARNED_WORKERS = 64  # workers of another wire version that are warned of one by one
 QUERYABLES = ("command", "status", "scene", "topology", "obstacle", "echo", "checkpoint")  # channels
+FORMER = "command of an older client"  # its queryable
+OUTDATED = (
+    "this client is older than the server, where each command has a key of its own; install the same release of "
+    "warpfactor on both sides"
+)
 
 
 class Queryables:
@@ -37,28 +43,32 @@ class Queryables:
     zenoh blocks where a client does not read.
 
     probe_slot: shared memory with which workers probe whether they can use it; None: there is none
+    rights: which commands are whose
     """
 
     def __init__(
         self, session: Session, server: str, incarnation: int, counters: Counters, probe_slot: Slot | None,
-        replies: SendQueue, claim: NameClaim,
+        replies: SendQueue, claim: NameClaim, rights: Rights,
     ):  # fmt: skip
+        self._rights = rights
         self._claim = claim
         self._replies = replies
         self._server = server
         self._incarnation = incarnation
         self._counters = counters
         self._probe_slot = probe_slot
-        self._command_key = key("command", server)
+        self._commands = commands(server)
+        self._former = f"{ROOT}/{server}/{FORMER_COMMAND}"
         self._echo_prefix = key("echo", server, worker="*")[:-1]
         self._answers: dict[str, bytes] = {}  # by key
         self._other_version: set[str] = set()  # workers
-        self._queue = CommandQueue(counters)
+        self._queue = CommandQueue(counters, account=rights.account)
         self._done = self._stamped(Reply())
         self._queryables = {}
-        for channel in QUERYABLES:
+        self._keys = {channel: key(channel, server) for channel in QUERYABLES} | {FORMER: self._former}
+        for channel, name in self._keys.items():
             ring: zenoh.handlers.RingChannel[zenoh.Query] = zenoh.handlers.RingChannel(MAX_QUERIES)
-            self._queryables[channel] = session.zenoh.declare_queryable(key(channel, server), ring)
+            self._queryables[channel] = session.zenoh.declare_queryable(name, ring)
             session.thread(f"queryable-{channel}", partial(self._run, channel))
 
     def set_answer(self, name: str, answer: bytes) -> None:
@@ -74,7 +84,7 @@ class Queryables:
         return self._queue.take_all()
 
     def _run(self, channel: str) -> None:
-        queryable, own = self._queryables[channel], zenoh.KeyExpr(key(channel, self._server))
+        queryable, own = self._queryables[channel], zenoh.KeyExpr(self._keys[channel])
         together = MAX_QUERIES if channel == "command" else 1
         while True:
             try:
@@ -94,8 +104,12 @@ class Queryables:
         """Answers queries, and queues commands. own: key expression of the queryable."""
         commands = []
         for query in queries:
-            if str(query.key_expr) == self._command_key:
+            asked = str(query.key_expr)
+            if asked.startswith(self._commands):
                 commands.append(query)
+                continue
+            if asked == self._former:
+                self._refuse(Refused(OUTDATED, "version"), query)
                 continue
             try:
                 self._serve(query, own)
@@ -143,7 +157,9 @@ class Queryables:
         received = []
         for query in queries:
             try:
-                received.append((parse(Command, query.payload, CHANNELS["command"].limit), query))
+                command = parse(Command, query.payload, CHANNELS["command"].limit)
+                self._check_key(command, query)
+                received.append((command, query))
             except Refused as refusal:
                 self._refuse(refusal, query)
         found = coalesce_moves(received, self._check)
@@ -154,14 +170,26 @@ class Queryables:
         if found.replaced:
             self._counters.add("moves_replaced", len(found.replaced))
         for command, query in found.accepted:
-            self._queue.put(command, self._replier(query))
+            if command.verb == "rights":
+                self._post(query, self._stamped(self._rights.of(command.client)))
+            else:
+                self._queue.put(command, self._replier(query))
+
+    def _check_key(self, command: Command, query: zenoh.Query) -> None:
+        """Raises Refused unless the key has the verb and the client: access rules know keys alone."""
+        asked = str(query.key_expr)
+        if asked != f"{self._commands}{command.verb}/{command.client}":
+            said = f"{command.verb[:80]!r} of {command.client[:80]!r}"
+            raise Refused(f"a Command, {said}, came under the key {asked[:200]}; allowed: its own", "key")
 
     def _check(self, command: Command) -> None:
         check_header(command, incarnation=self._incarnation if command.header.incarnation else None)
+        check_name(command.client, "Command.client")
         check_strings(command)
         check_strings(command.target, LONGEST_NAME)
         check_numbers(command)
         check_client(command.client, command.secret)
+        self._rights.check(command)
 
     def _refuse(self, refusal: Refused, query: zenoh.Query) -> None:
         self._counters.refuse(refusal)
@@ -181,7 +209,7 @@ class Queryables:
 
     def _send(self, query: zenoh.Query, data: bytes) -> None:
         try:
-            query.reply(self._command_key, data)
+            query.reply(query.key_expr, data)
         except zenoh.ZError as error:
             log.debug("a command was not answered: %s", error)
         finally:

@@ -51,15 +51,16 @@ class WebPage:
 
     server, connect: name and endpoint of the server
     quiet: it says nothing on standard output
+    options: more of sim-client web
     """
 
     def __init__(
-        self, server: str, connect: str, host: str, port: int, quiet: bool = False,
+        self, server: str, connect: str, host: str, port: int, quiet: bool = False, options: Sequence[str] = (),
         clock: Callable[[], float] = time.monotonic, start: Start | None = None,
     ):  # fmt: skip
         self._command = own_module(
             "clients", "web", "--exit-with-parent", "--parent", str(os.getpid()),
-            "--server", server, "--connect", connect, "--host", host, "--port", str(port),
+            "--server", server, "--connect", connect, "--host", host, "--port", str(port), *options,
         )  # fmt: skip
         output = subprocess.DEVNULL if quiet else None
         self._clock = clock

@@ -11,7 +11,7 @@ import zenoh
 from google.protobuf.message import Message
 
 from protocol import messages_pb2 as pb
-from protocol.channels import everything, key
+from protocol.channels import commands, everything, key
 from protocol.network.session import open_session
 from tests.ports import free_port
 from tests.sample_contact import MOVED, obstacle, pose
@@ -76,7 +76,7 @@ class FakeServer:
 
     def _answers(self, query: zenoh.Query) -> list[tuple[str, Message]]:
         asked = str(query.key_expr)
-        if asked == key("command", self.name):
+        if asked.startswith(commands(self.name)):
             assert query.payload is not None
             return [(asked, self._obey(pb.Command.FromString(bytes(query.payload))))]
         if asked == key("status", self.name):

@@ -13,7 +13,7 @@ import zenoh
 from clients.client import Client
 from clients.errors import ClientError
 from protocol import messages_pb2 as pb
-from protocol.channels import everything, key
+from protocol.channels import commands, everything, key, server_in
 from protocol.network.session import open_session
 from tests.clients.fake_server import FakeServer
 from tests.sample_run import header
@@ -35,7 +35,7 @@ def forged(query: zenoh.Query) -> None:
     head = header()
     head.incarnation = EVIL
     with query:
-        if str(query.key_expr).endswith("command"):
+        if str(query.key_expr).startswith(commands(server_in(query.key_expr))):
             answer: pb.Reply | pb.Status = pb.Reply(header=head, error="EVIL says no")
         else:
             answer = pb.Status(header=head, scene="EVIL", state="running", step=666)

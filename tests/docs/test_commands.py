@@ -12,11 +12,12 @@ from typer.core import TyperGroup, TyperOption
 from clients.__main__ import app as client
 from clients.demo.command import app as face
 from precond_worker.cli import app as worker
+from sim_server.certificates.command import app as certs
 from sim_server.cli import app as server
 from tests.docs.figures import DOCS, ROOT, table_under, texts
 
 TEXT = (DOCS / "commands.md").read_text()
-SHARED = {"--connect", "--server"}  # of all commands that talk to a server; said once
+SHARED = {"--connect", "--server", "--tls"}  # of all commands that talk to a server; said once
 
 
 def _launch() -> Any:
@@ -49,6 +50,7 @@ def _largest(option: TyperOption) -> float | None:
 
 PROGRAMS = {
     "sim-server SCENE.toml": typer.main.get_command(server),
+    "sim-server certs DIR": typer.main.get_command(certs),
     "precond-worker": typer.main.get_command(worker),
     "deploy/launch.py SCENE.toml": typer.main.get_command(_launch()),
 }
@@ -122,11 +124,12 @@ def test_examples_use_options_that_are_there() -> None:
     group = typer.main.get_command(client)
     assert isinstance(group, TyperGroup)
     commands = {"sim-server": PROGRAMS["sim-server SCENE.toml"], "precond-worker": PROGRAMS["precond-worker"]}
+    commands["sim-server certs"] = PROGRAMS["sim-server certs DIR"]
     commands |= {f"sim-client {name}": command for name, command in group.commands.items()}
     examples = _examples()
     assert len(examples) > 15
     for name, line in examples:
         words = line.split()
-        program = " ".join(words[:2]) if words[0] == "sim-client" else words[0]
+        program = " ".join(words[:2]) if words[0] == "sim-client" or words[1] == "certs" else words[0]
         known = {name for p in commands[program].params for name in (*p.opts, *p.secondary_opts)}
         assert {word for word in words if word.startswith("--")} <= known, (name, line)

@@ -19,7 +19,7 @@ from sim_server.updates import first_factors
 from tests.docs.figures import DOCS, table_under
 
 UNITS = ((1 << 30, "GiB"), (1 << 20, "MiB"), (1 << 10, "KiB"))
-NAMES = {"object": "O", "worker": "W", "client": "CLIENT", "incarnation": "INCARNATION"}
+NAMES = {"object": "O", "worker": "W", "client": "CLIENT", "incarnation": "INCARNATION", "verb": "VERB"}
 
 
 def size(count: int) -> str:

@@ -121,7 +121,7 @@ def test_keys_and_channels_are_those_of_contact_and_pushes(explained):
     for name in ("corotational", "fixed", "gravity"):
         assert not of(explained, name)["network"] and not of(explained, name)["log"]
     core = of(explained, CORE)
-    assert {root + "state/block", root + "command", root + "steps"} <= set(core["network"])
+    assert {root + "state/block", root + "command/*/*", root + "steps"} <= set(core["network"])
     assert {"/scene", "/topology/block", "/state/block", "/step/block"} <= set(core["log"])
 
 

@@ -6,6 +6,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from google.protobuf.message import DecodeError
 
 from protocol.channels import PROTOCOL, key
 from protocol.counters import Counters
@@ -13,6 +14,7 @@ from protocol.messages_pb2 import Command, Header, Interaction, ObstacleTarget, 
 from protocol.refused import Refused
 from sim_server.network.coalesce import coalesce_moves
 from sim_server.network.queryables import Queryables
+from sim_server.network.rights import Rights
 
 NAN = float("nan")
 
@@ -64,11 +66,20 @@ def test_a_malformed_move_replaces_nothing() -> None:
     assert sorted_out(*given) == ([1], [2], [0], [1, 2])
 
 
+def own_key(payload: bytes) -> str:
+    """Key under which a command comes."""
+    try:
+        sent = Command.FromString(payload)
+    except DecodeError:
+        return key("command", "sim", verb="push", client="me")
+    return key("command", "sim", verb=sent.verb, client=sent.client)
+
+
 class Query:
     """As zenoh hands it over. answers: what was replied; dropped: how often."""
 
     def __init__(self, payload: bytes, asked: str = "command"):
-        self.key_expr, self.payload = key("command", "sim") if asked == "command" else asked, payload
+        self.key_expr, self.payload = own_key(payload) if asked == "command" else asked, payload
         self.answers: list[Reply] = []
         self.dropped = 0
 
@@ -95,7 +106,7 @@ def queryables(counters: Counters) -> Any:
     """Queryables without a network: a posted reply is sent at once."""
     session: Any = SimpleNamespace(zenoh=SimpleNamespace(declare_queryable=lambda *_: None), thread=lambda *_: None)
     replies: Any = SimpleNamespace(post=lambda send: send() or True)
-    return Queryables(session, "sim", 5, counters, None, replies, SimpleNamespace(settled=True))  # type: ignore[arg-type]
+    return Queryables(session, "sim", 5, counters, None, replies, SimpleNamespace(settled=True), Rights(None))  # type: ignore[arg-type]
 
 
 def test_each_of_a_round_is_answered_once(queryables: Queryables, counters: Counters) -> None:

@@ -3,8 +3,8 @@
 
 import pytest
 
+from protocol.access.client_name import check_client, new_client
 from protocol.channels import check_name
-from protocol.client_name import check_client, new_client
 from protocol.refused import Refused
 
 

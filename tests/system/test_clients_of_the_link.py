@@ -3,6 +3,7 @@
 
 import math
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ import zenoh
 from link_helpers import Driver, chain, free_endpoint
 from zenoh.handlers import RingChannel
 
-from protocol.channels import PROTOCOL, key
+from protocol.channels import FORMER_COMMAND, PROTOCOL, key
 from protocol.messages_pb2 import (
     Command,
     Header,
@@ -27,8 +28,13 @@ from protocol.messages_pb2 import (
 from protocol.network.session import open_session
 from sim_server.network.command_queue import CAPACITY
 from sim_server.network.link import ServerLink
+from sim_server.network.queryables import OUTDATED
 
 pytestmark = pytest.mark.system
+
+
+def mine(header: Header, verb: str = "push", client: str = "me", **fields: Any) -> bytes:
+    return Command(header=header, verb=verb, client=client, **fields).SerializeToString()
 
 
 @pytest.fixture
@@ -79,7 +85,7 @@ def test_commands_reach_the_simulation_and_replies_the_client(stage: tuple[Drive
     driver, session = stage
     push = Interaction(object="beam", kind="push", point=Vector(x=1), force=Vector(y=-5), duration=0.1)
     command = Command(header=Header(protocol=PROTOCOL), client="me", verb="push", interaction=push)
-    handler = ask(session, key("command"), command.SerializeToString())
+    handler = ask(session, key("command", verb="push", client="me"), command.SerializeToString())
     received, reply = driver.until(lambda: driver.link.commands(), "the command")[0]
     assert received == command
     done = Interaction(id=4, object="beam", kind="push", nodes=3)
@@ -92,33 +98,54 @@ def test_commands_reach_the_simulation_and_replies_the_client(stage: tuple[Drive
 @pytest.mark.parametrize(
     ("payload", "text"),
     [
-        (b"", "Command.header.protocol is 0; allowed: 1"),
+        (mine(Header()), "Command.header.protocol is 0; allowed: 1"),
+        (b"", "a Command, '' of '', came under the key"),
         (b"\xff\xff\xff", "is not a valid message"),
         (b"\0" * 70_000, "Command has 70000 bytes; allowed: at most 65536"),
-        (Command(header=Header(protocol=PROTOCOL, incarnation=5)).SerializeToString(), "header.incarnation is"),
-        (Command(header=Header(protocol=PROTOCOL), verb="x" * 5000).SerializeToString(), "Command.verb has 5000"),
+        (mine(Header(protocol=PROTOCOL, incarnation=5)), "header.incarnation is"),
+        (mine(Header(protocol=PROTOCOL), object="x" * 5000), "Command.object has 5000"),
         (
-            Command(
-                header=Header(protocol=PROTOCOL), interaction=Interaction(force=Vector(z=math.nan))
-            ).SerializeToString(),
+            mine(Header(protocol=PROTOCOL), interaction=Interaction(force=Vector(z=math.nan))),
             "Vector.z is nan; allowed: finite",
         ),
+        (
+            mine(Header(protocol=PROTOCOL), verb="stop"),
+            "'stop' of 'me', came under the key warpfactor/sim/command/push/me",
+        ),
+        (mine(Header(protocol=PROTOCOL), client="you"), "'push' of 'you', came under the key"),
     ],
 )
 def test_bad_commands_are_answered_with_what_is_wrong(
     stage: tuple[Driver, zenoh.Session], payload: bytes, text: str
 ) -> None:
     driver, session = stage
-    answer = Reply.FromString(*answers(ask(session, key("command"), payload)))
+    answer = Reply.FromString(*answers(ask(session, key("command", verb="push", client="me"), payload)))
     assert text in answer.error
     assert driver.link.commands() == [] and driver.link.counters.refused == 1
 
 
+def test_a_client_of_before_verbs_had_keys_is_told_so(stage: tuple[Driver, zenoh.Session]) -> None:
+    driver, session = stage
+    answer = Reply.FromString(
+        *answers(ask(session, f"warpfactor/sim/{FORMER_COMMAND}", mine(Header(protocol=PROTOCOL))))
+    )
+    assert answer.error == OUTDATED and answer.header.incarnation == driver.link.incarnation
+    assert driver.link.commands() == [] and driver.link.counters.refusals["version"] == 1
+
+
+@pytest.mark.parametrize("asked", ["command/*/*", "command/stop/*", "command/**", "**"])
+def test_nobody_commands_under_more_than_one_key(stage: tuple[Driver, zenoh.Session], asked: str) -> None:
+    driver, session = stage
+    found = answers(ask(session, f"warpfactor/sim/{asked}", mine(Header(protocol=PROTOCOL), verb="stop")))
+    assert not found or any("came under the key" in Reply.FromString(data).error for data in found if data)
+    assert driver.link.commands() == []
+
+
 def test_more_commands_than_can_wait_are_turned_away(stage: tuple[Driver, zenoh.Session]) -> None:
     driver, session = stage
-    command = Command(header=Header(protocol=PROTOCOL), verb="push").SerializeToString()
-    waiting = [ask(session, key("command"), command) for _ in range(CAPACITY)]
-    surplus = Reply.FromString(*answers(ask(session, key("command"), command)))
+    command, where = mine(Header(protocol=PROTOCOL)), key("command", verb="push", client="me")
+    waiting = [ask(session, where, command) for _ in range(CAPACITY)]
+    surplus = Reply.FromString(*answers(ask(session, where, command)))
     assert "the server is busy" in surplus.error
     for _, reply in driver.until(lambda: driver.link.commands(), "the commands"):
         reply(Reply())

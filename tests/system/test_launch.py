@@ -154,7 +154,7 @@ def test_each_process_sees_its_gpu_alone(tmp_path: Path, monkeypatch: Any) -> No
         (["0"], [("sim-0", None), ("sim-1", None), ("local-1", None), ("local-2", None), ("local-2", None)]),
     ):
         seen.clear()
-        with launch.Fleet(whole, launch.distribute([1, 1], 2), "127.0.0.1", 7447, None, True) as fleet:
+        with launch.Fleet(whole, launch.distribute([1, 1], 2), "tcp/127.0.0.1", 7447, None, True) as fleet:
             fleet.use_gpus(pool, True, 2)
             fleet.start(2, ["--device", "gpu"], ["--device", "gpu"])
             fleet.workers.start(fleet.workers.workers[1])

@@ -67,7 +67,7 @@ impl Client {
         };
         let replies = self
             .session
-            .get(key("command"))
+            .get(key(&format!("command/{verb}/{}", self.id)))
             .payload(command.encode_to_vec())
             .target(QueryTarget::All)
             .consolidation(ConsolidationMode::None) // each reply at once, not when all who listen have answered

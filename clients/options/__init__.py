@@ -1,0 +1,2 @@
+# SPDX-License-Identifier: MIT
+"""Options of sim-client that several commands share."""
