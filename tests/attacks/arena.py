@@ -46,6 +46,7 @@ class Outcome:
     refused_honest: answers that the honest client did not get, or that were another's
     strangers: steps, states and statuses that the client took from somebody else
     first, last: steps between which it was; seconds: from its end to the next factor that was made and used
+    session: seconds from its end until somebody new has got in
     """
 
     refused_honest: int
@@ -53,6 +54,7 @@ class Outcome:
     first: int
     last: int
     seconds: float
+    session: float
 
 
 class Arena:
@@ -87,7 +89,7 @@ class Arena:
         end = time.monotonic() + PATIENCE
         while True:
             try:
-                found = Client(connect=[self.endpoint], timeout=2.0, tls=self._certs if self.tls else None)
+                found = Client(connect=[self.endpoint], timeout=1.0, tls=self._certs if self.tls else None)
                 found.timeout = 20.0
                 return found
             except ClientError:
@@ -128,8 +130,11 @@ class Arena:
             attacker.close()
         end, began = self.client.status(fresh=True).step, time.monotonic()
         self._wait(lambda: self._factor() > end, "a factor that was made after the attack")
+        factor = time.monotonic() - began
         lost += self._honest()
-        return Outcome(lost, self._strangers(), first, self.client.status(fresh=True).step, time.monotonic() - began)
+        self._connected().close()
+        session, last = time.monotonic() - began, self.client.status(fresh=True).step
+        return Outcome(lost, self._strangers(), first, last, factor, session)
 
     def _identity(self):  # type: ignore[no-untyped-def]
         return identity_of(self._certs / "viewer", ()) if self.tls else None
