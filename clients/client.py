@@ -41,6 +41,7 @@ Value = float | bool | str | Sequence[Any]  # of a parameter; text is TOML
 KINDS = ("operator", "participant", "viewer")  # certificates that are taken from a folder with all of them, the first
 LONGEST_SAVE = 60.0  # s that a checkpoint takes to be made and sent, at most
 LONGEST_STEPS = 60.0  # s that a server takes to answer `step`, at most
+FRESH_STATUSES = 3  # times that a status with positions is asked for
 
 
 class Client:
@@ -96,12 +97,15 @@ class Client:
 
         fresh: of this moment, with the positions of the objects, unless the server has no time for that.
         """
-        if fresh:
-            with contextlib.suppress(BadInput, ClientError):
-                self.command("status")
-        found = self._query("status", pb.Status)
-        if not found:
-            raise self._no_server()
+        for _ in range(FRESH_STATUSES if fresh else 1):
+            if fresh:
+                with contextlib.suppress(BadInput, ClientError):
+                    self.command("status")
+            found = self._query("status", pb.Status)
+            if not found:
+                raise self._no_server()
+            if found[0].objects and found[0].objects[0].HasField("low"):
+                break  # else the status of each second, which has no positions, came between command and query
         return found[0]
 
     def scene(self) -> pb.Scene:

@@ -82,15 +82,15 @@ def _objects(status: pb.Status) -> Table:
     return table
 
 
-def places(status: pb.Status) -> Table:
-    """Table of the extents and tips of the objects."""
+def places(status: pb.Status) -> Table | Text:
+    """Table of the extents and tips of the objects; a line where the status has none."""
     table = Table("object", "x", "y", "z [m]", "tip", **COMPACT)
     for found in status.objects:
         if found.HasField("low"):
             low, high, tip = found.low, found.high, found.tip
             spans = ((low.x, high.x), (low.y, high.y), (low.z, high.z))
             _add(table, found.object, *(f"{a:.3g} … {b:.3g}" for a, b in spans), f"{tip.x:.3g} {tip.y:.3g} {tip.z:.3g}")
-    return table
+    return table if table.row_count else Text("where objects are: the server had no time to tell; ask again")
 
 
 def _status(found: pb.ObjectStatus) -> Text:

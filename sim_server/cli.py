@@ -333,6 +333,8 @@ def _set_up(closing: ExitStack, o: Options) -> "tuple[Service, Supervisor | None
     if o.workers and not simulation.scene.integrator.explicit:  # which needs none
         endpoint = certificates.local_endpoint
         of_workers = ["--device", o.worker_device, *certificates.for_worker]
+        if not link.shared_memory:  # which was told, once
+            of_workers.append("--no-shared-memory")
         supervisor = Supervisor(o.workers, o.name, [endpoint], of_workers)
         closing.callback(supervisor.close)
         service.supervise(supervisor)

@@ -196,10 +196,10 @@ def follow(client: Client, scene: RerunScene, viewer: Viewer, recording: rr.Reco
 
 
 def _viewer(web: bool) -> Viewer:
-    if not web and not has_display():
-        web = True
+    served = not web and not has_display()
+    viewer = Viewer(web or served)
+    if served:
         say("no display here, so the viewer is served as a page")
-    viewer = Viewer(web)
     if viewer.page:
         say(f"open {viewer.page} in a browser on this machine; Ctrl-C ends the viewer")
     return viewer

@@ -108,7 +108,7 @@ def _open_first(connect: list[str], shared_memory: bool, timeout: float, tls: Id
 def _shared_memory_works() -> bool:
     obstacle = shm_limits.obstacle()
     if obstacle:
-        _warn_once(f"shared memory is off, arrays travel as bytes: {obstacle}")
+        _warn_once(f"shared memory is off, arrays travel as bytes, which is slower for large bodies: {obstacle}")
     return not obstacle
 
 

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""The libraries that a wheel brings, compiled for generations of x86-64 processors, and which of them are used here.
+"""The libraries that a wheel brings, compiled for generations of processors, and which of them are used here.
 
-A checkout brings none: there everything is compiled for the very processor. Levels: x86-64 psABI, table 3.1.
+A checkout brings none: there everything is compiled for the very processor. Levels: x86-64 psABI, table 3.1; a wheel
+for aarch64 has one variant, since all such processors have vectors of the same width.
 """
 
 from __future__ import annotations
@@ -18,11 +19,12 @@ CHOICE = "WARPFACTOR_KERNELS"
 NATIVE = "native"  # compiled here, for this processor
 
 _V3 = frozenset({"avx", "avx2", "bmi1", "bmi2", "f16c", "fma", "abm", "movbe", "xsave"})
-# Flags of /proc/cpuinfo that each needs, fastest first; abm is what Linux calls lzcnt.
+# Flags of /proc/cpuinfo that each needs, fastest first of each machine; abm is what Linux calls lzcnt.
 VARIANTS: dict[str, frozenset[str]] = {
     "x86-64-v4": _V3 | {"avx512f", "avx512bw", "avx512cd", "avx512dq", "avx512vl"},
     "x86-64-v3": _V3,
     "x86-64": frozenset(),
+    "armv8-a": frozenset({"asimd"}),
 }
 
 
@@ -32,7 +34,8 @@ def processor_flags() -> frozenset[str]:
         lines = Path("/proc/cpuinfo").read_text().splitlines()
     except OSError:
         return frozenset()
-    return frozenset(next((line.partition(":")[2].split() for line in lines if line.startswith("flags")), []))
+    named = (line.partition(":")[2].split() for line in lines if line.startswith(("flags", "Features")))  # x86, ARM
+    return frozenset(next(named, []))
 
 
 def present(libraries: Path) -> list[str]:

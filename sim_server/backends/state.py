@@ -20,6 +20,7 @@ class StateArray:
     rows: returns which of its rows belong to a body (an index of NumPy); None: none belongs to one alone
     resets: a reset puts it back; False: it is only known to the solver (corrections of factors, costs), or is reset
         in another way
+    added: of the versions with it; checkpoints of earlier ones lack it, and go on with what the start has
     """
 
     name: str
@@ -27,6 +28,7 @@ class StateArray:
     write: Callable[[NDArray[Any]], None]
     rows: Callable[[int], Any] | None = None
     resets: bool = True
+    added: bool = False
 
 
 def host_array(

@@ -2,9 +2,10 @@
 """Builds the wheel of this platform: the package, and its kernels compiled for generations of processors.
 
 `pip wheel .` and `python -m build --wheel` come here (pyproject.toml, tool.setuptools.cmdclass), with nothing but
-setuptools at hand. On Linux on x86-64 with a C++ compiler the libraries of all texts go into the wheel, and its tag
-says which glibc they need at least; elsewhere, and for editable installations, it has none and kernels are compiled
-when they are first used. WARPFACTOR_VARIANTS: variants separated by commas instead of all; "none": no libraries.
+setuptools at hand. On Linux with a C++ compiler for x86-64 or aarch64 ($CXX may be one for another machine) the
+libraries of all texts go into the wheel, and its tag says which glibc they need at least; elsewhere, and for editable
+installations, it has none and kernels are compiled when they are first used. WARPFACTOR_VARIANTS: variants separated
+by commas instead of all; "none": no libraries.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ FRAME = "kernels/hyperelastic.cu"  # of laws: no text by itself
 PATCH_FRAMES = ("kernels/hyperelastic_cells.cu", "kernels/hyperelastic_patches.cu")  # of those in PATCHED
 OPENMP = "libgomp.so.1"  # GPL 3 with the runtime exception; nothing that users have installed brings it
 OLDEST = (2, 17)  # glibc
-EVERY = ["x86-64-v4", "x86-64-v3", "x86-64"]  # variants, as processor_variants.py has them
+EVERY = {"x86_64": ["x86-64-v4", "x86-64-v3", "x86-64"], "aarch64": ["armv8-a"]}  # as processor_variants.py has them
 
 
 def patched() -> list[str]:
@@ -93,23 +94,39 @@ def glibc_needed(libraries: Path) -> tuple[int, int]:
 
 
 def _versions(library: Path) -> Iterator[tuple[int, int]]:
-    listed = subprocess.run(["objdump", "-p", str(library)], capture_output=True, text=True, check=True).stdout
+    listed = subprocess.run([objdump(), "-p", str(library)], capture_output=True, text=True, check=True).stdout
     for major, minor in re.findall(r"\bGLIBC_(\d+)\.(\d+)", listed.partition("Version References:")[2]):
         yield int(major), int(minor)
 
 
+def target() -> str:
+    """Machine that the C++ compiler makes code for: "x86_64", "aarch64"; empty without one, or not on Linux."""
+    name = next(filter(shutil.which, filter(None, (os.environ.get("CXX"), "g++", "clang++"))), None)
+    if sys.platform != "linux" or name is None:
+        return ""
+    said = subprocess.run([name, "-dumpmachine"], capture_output=True, text=True, check=True).stdout
+    return said.partition("-")[0]
+
+
+def objdump() -> str:
+    """Path of the objdump that reads code of the target; empty without one."""
+    for name in (f"{target()}-linux-gnu-objdump", "objdump" if target() == platform.machine() else None):
+        if name and (path := shutil.which(name)):
+            return path
+    return ""
+
+
 def wanted() -> list[str]:
     """Variants to compile here; empty where that cannot be, or is not wanted."""
-    if sys.platform != "linux" or platform.machine() != "x86_64" or not shutil.which("objdump"):
-        return []
-    if not any(shutil.which(name) for name in (os.environ.get("CXX"), "g++", "clang++") if name):
+    every = EVERY.get(target(), [])
+    if not every or not objdump():
         return []
     asked = [name for name in os.environ.get("WARPFACTOR_VARIANTS", "").split(",") if name]
     if asked == ["none"]:
         return []
-    if unknown := [name for name in asked if name not in EVERY]:
-        raise SystemExit(f"WARPFACTOR_VARIANTS: {', '.join(unknown)}: allowed are none, {', '.join(EVERY)}")
-    return asked or EVERY
+    if unknown := [name for name in asked if name not in every]:
+        raise SystemExit(f"WARPFACTOR_VARIANTS: {', '.join(unknown)}: allowed are none, {', '.join(every)}")
+    return asked or every
 
 
 class BuildWithLibraries(build_py):
@@ -143,4 +160,4 @@ class PlatformWheel(bdist_wheel):
         if not libraries.is_dir():
             return "py3", "none", "any"
         major, minor = glibc_needed(libraries)
-        return "py3", "none", f"manylinux_{major}_{minor}_{platform.machine()}"
+        return "py3", "none", f"manylinux_{major}_{minor}_{target()}"

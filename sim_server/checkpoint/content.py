@@ -172,7 +172,7 @@ def restore(simulation: Simulation, checkpoint: Checkpoint) -> Manifest:
         saved = _as_of_this_version(manifest.resolved)
         if digest(saved) != digest(now):
             raise InputError(f"of another scene ({_differences(saved, now)})")
-    arrays = state_arrays(simulation)
+    arrays = [a for a in state_arrays(simulation) if not a.added or f"state/{a.name}" in checkpoint.arrays]
     values = [checkpoint.array(f"state/{a.name}", now.dtype, now.shape) for a in arrays for now in [a.read()]]
     known = {f"state/{a.name}" for a in arrays}
     if other := [name for name in checkpoint.arrays if name.startswith("state/") and name not in known]:

@@ -9,6 +9,7 @@ import secrets
 import shutil
 import stat
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -54,10 +55,6 @@ class Repeated:
     def records(self) -> list[Record]:
         """Returns them in the order in which they came."""
         return list(self._records.values())
-
-    @property
-    def bytes(self) -> int:
-        return sum(len(record.data) for record in self._records.values())
 
 
 class Pieces:
@@ -107,7 +104,7 @@ class Pieces:
         if self._records and self._rotation.due(self._file.size, time.monotonic() - self._begun):
             self.finish(notes)
             self._kept.add(self.path, self._file_size)
-            self._begin(repeats=True)
+            self._begin(self.repeated.records(), repeats=True)
         self._kept.keep_budget(self._file.size)
 
     def finish(self, notes: dict[str, int]) -> None:
@@ -125,19 +122,19 @@ class Pieces:
         self._ended_bytes += size
         self._kept.add(self.path, size)
 
-    def may_go_on(self) -> bool:
-        """True if a new file may be begun after one was abandoned: there is room where it was."""
+    def may_go_on(self, first: Sequence[Record]) -> bool:
+        """True if a new file that begins with these may be begun after one was abandoned: there is room."""
         try:
             free = shutil.disk_usage(self._path.parent).free
         except OSError:
             return False
-        return self._regular and free >= ROOM + 2 * self.repeated.bytes
+        return self._regular and free >= ROOM + 2 * sum(len(record.data) for record in first)
 
-    def go_on(self) -> None:
-        """Begins a new file after one was abandoned. Raises OSError or InputError, and leaves none then."""
+    def go_on(self, first: Sequence[Record]) -> None:
+        """Begins a new file with these after one was abandoned. Raises OSError or InputError, and leaves none then."""
         number = self._number
         try:
-            self._begin(repeats=False)
+            self._begin(first, repeats=False)
         except OSError:
             self._file.abandon()
             with contextlib.suppress(OSError):
@@ -145,9 +142,8 @@ class Pieces:
             self._number = number
             raise
 
-    def _begin(self, repeats: bool) -> None:
+    def _begin(self, first: Sequence[Record], repeats: bool) -> None:
         """repeats: what it begins with is in the file before, too, and nothing is missing between them"""
-        first = self.repeated.records()
         self._number += 1
         try:
             self._file = McapFile(self.path, self._compression, True, self._origin(len(first) if repeats else 0))

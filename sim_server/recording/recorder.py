@@ -244,13 +244,17 @@ class Recorder:
             with self._changed:
                 if self._changed.wait_for(lambda: self._closing, pause):
                     return False
-                if not self._pieces.may_go_on():
-                    continue
-                try:
-                    self._pieces.go_on()
-                except (OSError, InputError):
-                    pause = min(2 * pause, LONGEST_PAUSE)
-                    continue
+                first = self._pieces.repeated.records()
+            if not self._pieces.may_go_on(first):
+                continue
+            try:
+                self._pieces.go_on(first)  # not under the lock: nobody who appends waits for the disk
+            except (OSError, InputError):
+                pause = min(2 * pause, LONGEST_PAUSE)
+                continue
+            with self._changed:
+                self._waiting.extend(r for r in self._pieces.repeated.records() if r not in first)  # came meanwhile
+                self._waiting_bytes = sum(len(r.data) for r in self._waiting)
                 then = f"it goes on in {self._pieces.path}, {self._missing} records are missing"
                 self.failure += f"; {then}"
                 self.broken = False

@@ -214,7 +214,7 @@ def test_pieces_become_a_page_with_its_table_of_settings(tmp_path: Path, monkeyp
              "## Work and precision", "### Not done", "## Order in the mesh", "## How good the estimates")  # fmt: skip
     places = [text.index(title) for title in order]
     assert places == sorted(places)
-    assert "Not measured here: Newton, Genesis, PyBullet." in text
+    assert "Not measured here: Newton, PyBullet, Genesis." in text
     assert (
         "| neo-Hookean beam | backward Euler | 1 | 1 |" in text
         and "| beam | 4 | 1536 | 1.6e-02 | 3.1e-02 | 2 | 2 |" in text

@@ -13,8 +13,10 @@ import pytest
 
 from sim_server.scene import load
 from sim_server.simulation import Simulation
+from tests.backends import fake_cupy
+from tests.backends.test_gpu_newton_graph import name
 from tests.bench.gpu import __main__ as gpu
-from tests.bench.gpu import page
+from tests.bench.gpu import page, trial
 from tests.bench.gpu import traffic as moved
 from tests.bench.gpu.others import lower
 from tests.bench.gpu.problem import BARS, MATERIALS, Problem
@@ -22,6 +24,8 @@ from tests.bench.gpu.rows import row, search_row
 from tests.bench.gpu.served import row as served_row
 from tests.bench.gpu.steps import SEARCHES, STEPS, Beams, Search, rounds
 from tests.docs.figures import table_under
+from tests.scenes import bar, scene
+from tests.support import nvrtc
 
 ROOT = Path(__file__).resolve().parents[2]
 DEVICE = {
@@ -75,6 +79,27 @@ def test_scenes_make_the_linearizations_that_they_need(search: Search, made: flo
     assert {(s.most, s.needed) for s in SEARCHES} == {(1, 1), (4, 1), (2, 2), (4, 4)}
 
 
+def test_steps_with_forces_once_more_and_without_a_loop_differ_by_these(tmp_path: Path, monkeypatch: Any) -> None:
+    monkeypatch.setattr(nvrtc, "compiled", lambda *_: (b"code", ""))
+    trial_of = ["pcg", "update_state", "elements", "nodes", "accept_trial"]
+
+    def launches(cupy: Any) -> tuple[list[str], list[str]]:
+        sim = Simulation(scene(bar((2, 1, 1), fixed="X < 0.01"), integrator={"linearizations": 4}), "gpu")
+        cupy.ran.clear()
+        sim.engine.assemble()
+        first, cupy.ran[:] = [name(x) for x in cupy.ran if x[0] == "fused"], []
+        sim.engine.solve()
+        return first, [name(x) for x in cupy.ran]
+
+    with fake_cupy.installed(tmp_path, None, monkeypatch) as cupy:
+        assert launches(cupy) == (["elements", "nodes", "blocks"], [*trial_of, "end"])
+        with trial.forces_twice():
+            assert launches(cupy) == (["elements", "nodes"] * 2 + ["blocks"], [*trial_of, "end"])
+        cupy.kernels["accept_trial"] = lambda arguments, loop: fake_cupy.go_on(loop, True) if loop else None
+        with trial.without_loop():
+            assert launches(cupy) == (["elements", "nodes", "blocks"], [*trial_of, "end"])
+
+
 def test_factor_of_the_sample_is_that_of_its_matrix(found: tuple[Beams, Any]) -> None:
     sample = found[1].sample
     factor, order = lower(sample.pattern, sample.factor.astype(float)), sample.pattern.permutation
@@ -123,8 +148,9 @@ def test_pieces_become_one_page(found: tuple[Beams, Any], tmp_path: Path) -> Non
     search = {"tets": 3000, "linearizations": 1, "needed": 1, "tolerance": 1e-6, "us p50": 80.0, "settings": ""}
     searches = [search, search | {"linearizations": 2, "needed": 2, "tolerance": 0.1, "us p50": 100.0}]
     first = piece(
-        tmp_path / "a.json", [one | {"us p50": 90.0}, batch], others=others, served=served, linearizations=searches
-    )
+        tmp_path / "a.json", [one | {"us p50": 90.0}, batch], others=others, served=served, linearizations=searches,
+        trial=[{"tets": 3000, "settings": "", "one, us": 80.0, "of one": 1.5}],
+    )  # fmt: skip
     other = one | {"us p50": 11.5, "settings": "solver.threads=2"}
     second = piece(tmp_path / "b.json", [one | {"us p50": 22.5}, other])
     gpu.merge([first, second], tmp_path / "out")
@@ -133,10 +159,11 @@ def test_pieces_become_one_page(found: tuple[Beams, Any], tmp_path: Path) -> Non
     assert lines and lines[0][2:4] == ["22.5", "0.5"] and "321" in lines[0]  # ours, over the aim of 45; direct
     assert "| 512 beams of 540 | 500 | 1000 | 2 |" in text and "5.12e+05" not in text and "| 512000 |" in text
     assert text.count("| 540 tets |") == 1 and "| solver.threads=2 | 11.5 |" in text
-    assert "pieces = 2" in text and "commit b" in text and "| 2026-01-01 | a | steps |" in text
+    assert "pieces = 2" in text and "commit b" in text and "| 2026-01-01 | a | none | steps |" in text
     assert "| cpu | 77 | 12 |" in text
     beside = table_under(text, "Several linearizations")
     assert [row["of one"] for row in beside if row["needed"] == "2"] == ["1.25"]
+    assert text.index("Forces: what the kernels over elements") < text.index("| 3000 | 80 | 1.5 |")
     assert (tmp_path / "out" / "gpu.png").read_bytes().startswith(b"\x89PNG")
     again = json.loads((tmp_path / "out" / "gpu.json").read_text())
     assert page.merged([again["data"]]) == again["data"]

@@ -12,6 +12,7 @@ import pytest
 
 from clients.client import Client
 from clients.errors import BadInput, ClientError
+from clients.watch import places
 from protocol import messages_pb2 as pb
 from protocol.channels import PROTOCOL
 from tests.clients.fake_server import FakeServer
@@ -48,6 +49,25 @@ def test_status_scene_and_meshes(client: Client) -> None:
     meshes = client.meshes()
     assert sorted(meshes) == ["beam", "liver"]
     np.testing.assert_array_equal(meshes["beam"].rest, REST)
+
+
+def test_a_status_without_positions_is_asked_for_again(server: FakeServer, client: Client) -> None:
+    """That of each second has none and may come between a command and its query; without any a line says so."""
+    told, without = server.status, [1, 0]  # from behind: in the reply to the command, in that to the query
+
+    def status() -> pb.Status:
+        found = told()
+        if without and without.pop():
+            for each in found.objects:
+                each.ClearField("low")
+        return found
+
+    server.status = status  # type: ignore[method-assign]
+    assert client.status(fresh=True).objects[0].HasField("low")
+    assert [command.verb for command in server.commands] == ["status", "status"]
+    without.extend([1] * 10)
+    found = client.status(fresh=True)
+    assert not found.objects[0].HasField("low") and "ask again" in str(places(found))
 
 
 def test_push_says_what_it_means(server: FakeServer, client: Client) -> None:

@@ -46,7 +46,9 @@ def test_an_old_factor_serves_after_a_cut_as_it_did_before(name, monkeypatch):
     assert max(after) <= 2 * max(uncut) + 2
     assert max(iterations(beam("every-1", "block_jacobi"), where)) > 4 * max(after)
     monkeypatch.setattr(Cutting, "cut_input", lambda *_: None)
-    assert max(iterations(beam("lockstep-6"), where)) > 2 * max(after), "without the method"
+    plain = beam("lockstep-6")
+    plain.engine.forget_matrices(0)  # or the factor would be refreshed where the cut changed the matrix
+    assert max(iterations(plain, where)) > 2 * max(after), "without the method"
 
 
 def prepared(where: str) -> Simulation:

@@ -7,8 +7,9 @@ reads what the loop has left in its rings, and may be called from another thread
 
 import ctypes as c
 import time
+import weakref
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from typing import Any, cast
 
@@ -26,6 +27,7 @@ from sim_server.backends.cpu import structs
 from sim_server.backends.cpu.device import CpuLaunch
 from sim_server.backends.cpu.energies import NativeEnergies
 from sim_server.backends.cpu.halving import NativeHalving
+from sim_server.backends.cpu.processors import usable_threads
 from sim_server.backends.euler_form import EulerForm
 from sim_server.backends.newton import Newton
 from sim_server.backends.rank_one import RankOne
@@ -35,6 +37,7 @@ from sim_server.backends.state import StateArray, host_array, memory_of, numbers
 from sim_server.backends.ties import Ties
 
 Reals = NDArray[np.float64]
+SHARED_SIZE = 600  # degrees of freedom from which on the solves of a factor are shared out between threads
 HISTORY = 1024  # changes of the diagonal that are remembered, of each body
 KNOWN_CONTACTS = 32, 16384  # blocks of contacts that are remembered: of each surface node of a body, and of all at most
 
@@ -47,10 +50,11 @@ def _library() -> c.CDLL:
         {
             "wf_assemble": (None, [loop]), "wf_solve": (None, [loop]), "wf_run": (c.c_int64, [loop, c.c_int64]),
             "wf_wait": (c.c_int32, [loop]), "wf_restart": (None, [loop, c.c_int32]),
-            "wf_copy_matrix": (None, [loop, c.c_int32, p]),
+            "wf_copy_matrix": (None, [loop, c.c_int32, p]), "wf_note_matrix": (None, [loop, c.c_int32]),
             "wf_post_factor": (p, [c.POINTER(structs.Body), p]), "wf_post_binding": (p, [c.POINTER(structs.Launch), p]),
             "wf_post_changes": (p, [loop, p]), "wf_take_changes": (None, [loop]),
-            "wf_apply_factor": (None, [c.POINTER(structs.Factor), p, p, p]),
+            "wf_apply_factor": (None, [c.POINTER(structs.Factor), p, p, p, c.c_int32]),
+            "wf_plan": (p, [c.POINTER(structs.Pattern), c.c_int32]), "wf_delete_plan": (None, [p]),
             "wf_precondition": (None, [loop, c.c_int32, p, p, p]),
         },
     )  # fmt: skip
@@ -58,28 +62,47 @@ def _library() -> c.CDLL:
     return library
 
 
-class NativeFactor:
-    """A factor in memory that native code can apply: to the given values, which are not copied."""
+class NativePattern:
+    """The pattern of a factor as native code reads it. threads: shares the solves out between so many, if it can and
+    that pays; 0: not at all. Of one body: its solves work in memory that belongs to the pattern."""
 
-    def __init__(self, pattern: FactorPattern, values: NDArray[Any], step: int = -1):
+    def __init__(self, pattern: FactorPattern, threads: int = 0):
         self.pattern = pattern
-        self.values = values
         width, height = np.diff(pattern.super_start).astype(np.int64), np.diff(pattern.row_start)
         sizes = width * height - width * (width - 1) // 2
         self._value_start = np.concatenate([[0], np.cumsum(sizes)[:-1]]).astype(np.int64)
-        self._pattern = structs.Pattern(
+        self.native = structs.Pattern(
             size=pattern.size, supernodes=len(width), permutation=pattern.permutation.ctypes.data,
             super_start=pattern.super_start.ctypes.data, row_start=pattern.row_start.ctypes.data,
             rows=pattern.rows.ctypes.data, value_start=self._value_start.ctypes.data,
         )  # fmt: skip
+        if threads and pattern.size >= SHARED_SIZE:
+            library = _library()
+            self.native.plan = library.wf_plan(c.byref(self.native), threads)
+            weakref.finalize(self, library.wf_delete_plan, self.native.plan)
+
+    @property
+    def is_shared(self) -> bool:
+        """True if threads share its solves."""
+        return bool(self.native.plan)
+
+
+class NativeFactor:
+    """A factor in memory that native code can apply: to the given values, which are not copied."""
+
+    def __init__(self, pattern: FactorPattern | NativePattern, values: NDArray[Any], step: int = -1):
+        self._pattern = pattern if isinstance(pattern, NativePattern) else NativePattern(pattern)
+        self.pattern = self._pattern.pattern
+        self.values = values
         self.native = structs.Factor(
-            pattern=c.addressof(self._pattern), values=values.ctypes.data, step=step, bytes=values.itemsize
+            pattern=c.addressof(self._pattern.native), values=values.ctypes.data, step=step, bytes=values.itemsize
         )
 
     @classmethod
-    def empty(cls, pattern: FactorPattern, dtype: np.dtype | type) -> "NativeFactor":
+    def empty(cls, pattern: FactorPattern | NativePattern, dtype: np.dtype | type) -> "NativeFactor":
         """Room for a factor, to be filled."""
-        return cls(pattern, np.zeros(pattern.nonzeros, dtype))
+        full = pattern.pattern if isinstance(pattern, NativePattern) else pattern
+        return cls(pattern, np.zeros(full.nonzeros, dtype))
 
     @property
     def address(self) -> int:
@@ -91,11 +114,11 @@ class NativeFactor:
         self.values[:] = values
         self.native.step = step
 
-    def apply(self, r: Reals) -> Reals:
-        """P^-1 r, (size,), outside of any step. A probe for tests and benchmarks."""
+    def apply(self, r: Reals, threads: int = 1) -> Reals:
+        """P^-1 r, (size,), outside of any step, on so many threads at most. A probe for tests and benchmarks."""
         r = np.ascontiguousarray(r, dtype=np.float64)
         z, work = np.empty_like(r), np.empty(2 * len(r))
-        _library().wf_apply_factor(c.byref(self.native), r.ctypes.data, z.ctypes.data, work.ctypes.data)
+        _library().wf_apply_factor(c.byref(self.native), r.ctypes.data, z.ctypes.data, work.ctypes.data, threads)
         return z
 
 
@@ -104,6 +127,7 @@ class Mailbox:
     """Factor buffers of a body, two of them: one in use, the other waiting or to be filled."""
 
     buffers: list[NativeFactor]
+    pattern: NativePattern | None = None  # of the newest buffer
     waiting: NativeFactor | None = None  # as posted last
     in_use: NativeFactor | None = None  # as far as the mailbox has told
 
@@ -407,6 +431,38 @@ class _NativeContact:
         native.body = c.addressof(self._references)
 
 
+class _NativeRefresh:
+    """What A of a body had on its diagonal when copies were taken, and room to solve directly where it changed most."""
+
+    def __init__(self, body: Any, blocks: int):
+        n = body.last - body.first
+        capacity = min(WIDEST_CUT * blocks, LARGEST_CUT)
+        self.carried: dict[str, NDArray[Any]] = {
+            "step": np.full(KNOWN_DIAGONALS, -1, np.int64), "block": np.zeros((KNOWN_DIAGONALS, n, 6), np.float32)
+        }  # fmt: skip
+        self._room: dict[str, NDArray[Any]] = {
+            "at_rest": np.zeros(n), "changed_at": np.zeros(n), "free": np.ones(n), "node": np.zeros(n, np.int32),
+            "place": np.zeros(n, np.int32), "first": np.zeros(3 * n, np.int32), "row": np.zeros(3 * n, np.int64),
+            "envelope": np.zeros(capacity), "t": np.zeros(3 * n), "room": np.zeros(3 * n),
+        }  # fmt: skip
+        self._score = np.zeros(n)
+        self._nodes = structs.CutNodes(nodes=n, capacity=capacity)
+        for name, array in self._room.items():
+            setattr(self._nodes, name, array.ctypes.data)
+        self.native = structs.KnownDiagonals(
+            kept=KNOWN_DIAGONALS, score=self._score.ctypes.data, room=c.addressof(self._nodes),
+            **{name: array.ctypes.data for name, array in self.carried.items()},
+        )  # fmt: skip
+        body.correction.known = c.addressof(self.native)
+
+    def state(self, name: str) -> list[StateArray]:
+        """Returns what steps carry on; no reset takes it back."""
+        arrays = [host_array(f"{name}.{k}", a, resets=False) for k, a in self.carried.items()]
+        return [replace(a, added=True) for a in (numbers_array(f"{name}.numbers", self.native), *arrays)]
+
+
+REFRESHED_NODES = 500  # of a body from which on its factors may be refreshed
+KNOWN_DIAGONALS = 8  # copies of a body that are remembered: more than are under way at a time
 LARGEST_CUT = 4_000_000  # entries of the envelope
 WIDEST_CUT = 30 * 9  # as ENOUGH_FOR_CUTS of native/cut_nodes.h, in numbers of A a block
 
@@ -483,7 +539,7 @@ class CpuEngine(Reports):
         loop.bodies, loop.nodes, loop.body = bodies, nodes, c.addressof(self._body)
         for name in ("row_start", "columns", "values", "b", "y", "x", "v", "clock", "moving"):
             setattr(loop, name, arrays[name].ctypes.data)
-        loop.work, loop.threads = self._work.ctypes.data, given.solver.threads
+        loop.work, loop.threads = self._work.ctypes.data, usable_threads(given.solver.threads)
         self._rank_one = given.rank_one and _NativeRankOne(given.rank_one, arrays["rotation"], loop)
         self._newton = None
         if given.newton:
@@ -510,6 +566,12 @@ class CpuEngine(Reports):
             self._contact.native.predictor = given.euler.start_v.ctypes.data
         elif self._contact and self._newton:
             self._contact.native.predictor = self._newton.search_in_contact(bodies).ctypes.data
+        starts = arrays["row_start"]
+        self._refresh = {
+            i: _NativeRefresh(entry, int(starts[entry.last] - starts[entry.first]))
+            for i, entry in enumerate(self._body)
+            if entry.last - entry.first >= REFRESHED_NODES and given.solver.preconditioner in ("auto", "cholesky")
+        }
         self._cut: dict[int, _NativeCut] = {}
         if given.cut and given.solver.wants_factors:
             self._cut = {i: _NativeCut(given.cut, self._body[i], given.dt, arrays) for i in given.cut.bodies}
@@ -551,6 +613,7 @@ class CpuEngine(Reports):
         To be called between `assemble` and `solve`.
         """
         entry, start = self._body[body], self._arrays["row_start"]
+        self._native.wf_note_matrix(c.byref(self.loop), body)
         values: Reals = self._arrays["values"][start[entry.first] : start[entry.last]]
         if not self._contact:
             return values
@@ -591,7 +654,8 @@ class CpuEngine(Reports):
             host_array("engine.balance", self._energies.balance.view(np.uint8), resets=False),
             host_array("engine.clock", self._arrays["clock"], resets=False),
         ]
-        return [*own, *(a for part in parts for a in part), *(a for part in corrections for a in part)]
+        known = [refresh.state(f"engine.known{k}") for k, refresh in self._refresh.items()]
+        return [*own, *(a for part in (*parts, *corrections, *known) for a in part)]
 
     def _state_of_correction(self, body: int) -> list[StateArray]:
         """Returns what is known of the changes since the matrix of the factor in use. No reset takes it back."""
@@ -678,6 +742,15 @@ class CpuEngine(Reports):
         stands still."""
         return int(self._body[body].correction.used)
 
+    def forget_matrices(self, body: int) -> None:
+        """Has no factor of the body refreshed from now on. For benchmarks; only while the loop stands still."""
+        self._body[body].correction.known = None
+
+    def refreshed(self, body: int) -> int:
+        """Number of nodes on which the last solve was exact beside its factor. A probe for tests; only while the loop
+        stands still."""
+        return int(self._refresh[body].native.refreshed) if body in self._refresh else 0
+
     def cut_nodes(self, body: int) -> tuple[int, int, int]:
         """Nodes that lost elements since the matrix of the factor in use, with neighbours; those that the last solve
         treated; nodes without elements. A probe for tests; only while the loop stands still."""
@@ -737,10 +810,15 @@ class CpuEngine(Reports):
             if buffer is mail.in_use:
                 continue
             if buffer.pattern is not pattern or buffer.values.dtype != dtype:
-                mail.buffers[i] = NativeFactor.empty(pattern, dtype)
+                mail.buffers[i] = NativeFactor.empty(self._native_pattern(mail, pattern), dtype)
             return mail.buffers[i]
-        mail.buffers.append(NativeFactor.empty(pattern, dtype))
+        mail.buffers.append(NativeFactor.empty(self._native_pattern(mail, pattern), dtype))
         return mail.buffers[-1]
+
+    def _native_pattern(self, mail: Mailbox, pattern: FactorPattern) -> NativePattern:
+        if mail.pattern is None or mail.pattern.pattern is not pattern:
+            mail.pattern = NativePattern(pattern, self.loop.threads)
+        return mail.pattern
 
     def factor_step(self, body: int) -> int:
         """Step of the factor in use, -1 without one."""

@@ -63,6 +63,11 @@ class CutNodes(c.Structure):
 
 
 @LOOP.struct
+class KnownDiagonals(c.Structure):
+    """Diagonals of earlier matrices of a body."""
+
+
+@LOOP.struct
 class Correction(c.Structure):
     """Low-rank correction of a factor."""
 

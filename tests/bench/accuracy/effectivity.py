@@ -29,10 +29,12 @@ WAYS: dict[str, Settings] = {
 }
 
 
-def ways(case: Case) -> dict[str, Settings]:
-    """Settings by name: those above, and bounds of the error where there are any."""
+def ways(case: Case, device: str) -> dict[str, Settings]:
+    """Settings by name: those above, in contact on a GPU of one linearization, and bounds of the error."""
+    several = not (case.contact and device == "gpu")
+    fixed = {name: way for name, way in WAYS.items() if several or "integrator.linearizations" not in way}
     bounds = {f"position = {bound} m": {"accuracy.position": bound} for bound in case.positions}
-    return WAYS | {name: settings for name, settings in bounds.items() if accepts(case, settings)}
+    return fixed | {name: settings for name, settings in bounds.items() if accepts(case, settings)}
 
 
 def rows(case: Case, name: str, way: Settings, device: str, steps: int = STEPS) -> list[Row]:

@@ -30,8 +30,12 @@ HERE = Path(__file__).parent
 FRAME = RUBBER.dt
 POISSON, DENSITY = 0.45, 1000.0  # of the scene
 US = "ours"
-MODULES = {"MuJoCo": "mujoco", "Newton": "newton"}  # of those that have a script beside this file
-WITHOUT_SCRIPT = ("Genesis", "PyBullet")
+MODULES = {
+    "MuJoCo": "mujoco",
+    "Newton": "newton",
+    "PyBullet": "pybullet",
+}  # of those that have a script beside this file
+WITHOUT_SCRIPT = ("Genesis",)
 Row = dict[str, Any]
 
 
@@ -87,6 +91,14 @@ def _vbd(young: float, ms: float, iterations: Sequence[int]) -> list[Way]:
     ]  # fmt: skip
 
 
+def _pybullet(young: float, milliseconds: Sequence[float]) -> list[Way]:
+    limit: dict[str, Any] = {"limit": 2.5e-4 if young < 5e6 else 1.25e-4}
+    return [
+        Way("PyBullet", "neo-Hookean", f"{ms:g} ms", young, 1e-3 * ms, "peers_pybullet.py", "pybullet", {}, **limit)
+        for ms in milliseconds
+    ]
+
+
 def ways(young: float) -> list[Way]:
     """Of a stiffness [Pa]: explicit steps as long as is stable and half of that, one that is not; all the others."""
     soft = young < 5e6
@@ -95,6 +107,7 @@ def ways(young: float) -> list[Way]:
         *_mujoco("RK4", young, (4.0, 2.0, 1.0) if soft else (1.0, 0.5, 0.25), integrator="RK4"),
         *_mujoco("discrete, CG", young, (20.0, 10.0, 5.0), integrator="discrete", solver="CG"),
         *_mujoco("discrete, Newton", young, (20.0,), integrator="discrete", solver="Newton"),
+        *_pybullet(young, (2.0, 1.0, 0.5) if soft else (1.0, 0.5, 0.25)),
         *_semi_implicit(young, (2.0, 1.0, 0.5) if soft else (1.0, 0.5, 0.25)),
         *_vbd(young, 20.0, (10, 30, 100)), *_vbd(young, 5.0, (20,)), *_vbd(young, 2.0, (10,)),
     ]  # fmt: skip

@@ -18,7 +18,7 @@ KEYS = {  # what tells the rows of a table apart
     "peers": ("device", "who", "E MPa", "series", "value"),
 }
 WEIGHTS = {axes.STEPS: 40, axes.SCHEME: 120, "tolerance, preconditioner": 60}  # seconds, of an axis of a beam
-SECONDS = {"MuJoCo": 5, "Newton": 15}  # weight of a point of others
+SECONDS = {"MuJoCo": 5, "Newton": 15, "PyBullet": 10}  # weight of a point of others
 
 
 def units(device: str, rounds: int, quick: bool, python: Path | None) -> list[Unit]:
@@ -33,7 +33,7 @@ def units(device: str, rounds: int, quick: bool, python: Path | None) -> list[Un
         explicit = [case for case in cases if case.explicit]
         found += [Unit("meshes", case.name, 100, partial(sources.of_meshes, case, cells)) for case in explicit]
     for case in cases:
-        for name, way in list(effectivity.ways(case).items())[: 1 if quick else None]:
+        for name, way in list(effectivity.ways(case, device).items())[: 1 if quick else None]:
             measure = partial(effectivity.rows, case, name, way, device)
             found.append(Unit("effectivity", f"{case.name}, {name}, {device}", 20, measure))
     return found if quick else [*found, *_peers(device, rounds, python)]

@@ -70,9 +70,10 @@ step where the run does."""
 
 PEERS = """\
 The neo-Hookean beam with E = 1 and 10 MPa, each beside the small steps of its own law: MuJoCo (St. Venant and
-Kirchhoff) beside its RK4, Newton's semi-implicit solver (neo-Hookean with a logarithm) beside its own, Newton's VBD
-(the law of this scene) and ours beside our explicit substeps, SciPy with CHOLMOD (beam.toml: corotational) beside
-ours of that scene. *reference*: how far its small steps are from those twice as long. *error of the steps*: of VBD,
-SciPy and backward Euler, from steps of the same length solved exactly. Same mesh and masses, no damping (beam.toml:
-0.1/s). Times of others are processor time of the whole process without its start and compilation, on a GPU wall
-time; ours are as above, SciPy's step factorizes itself."""
+Kirchhoff) beside its RK4, Newton's semi-implicit solver and PyBullet (neo-Hookean with a logarithm) beside their own,
+Newton's VBD (the law of this scene) and ours beside our explicit substeps, SciPy with CHOLMOD (beam.toml: corotational)
+beside ours of that scene. *reference*: how far its small steps are from those twice as long. *error of the steps*: of
+VBD, SciPy and backward Euler, from steps of the same length solved exactly. Same mesh, no damping (beam.toml: 0.1/s),
+same masses, but in PyBullet one mass for all nodes. Times of others are processor time of the whole process without its
+start and compilation, on a GPU wall time; ours are as above, SciPy's step factorizes itself. Processor time is longer
+where the load of a run is above the cores, up to twice as long."""

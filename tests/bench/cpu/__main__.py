@@ -17,7 +17,6 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -29,13 +28,17 @@ from sim_server.service.supervisor import Supervisor
 from sim_server.simulation import Simulation
 from sim_server.updates.driver import Driver
 from sim_server.updates.first_factors import FirstFactors
+from tests.bench.cpu import threads as several
+from tests.bench.cpu import transients
 from tests.bench.cpu.scipy_step import ScipyStep
+from tests.bench.harness.pieces import Merged, Piece, arguments_of_pieces, say, shown
 from tests.bench.harness.report import ROOT, Report, plots
 
 SCENE = ROOT / "deploy" / "scenes" / "sofa_beam.toml"
-CELLS = {540: (3, 3, 10), 3000: (5, 5, 20), 7350: (7, 7, 25), 24000: (10, 10, 40)}
+CELLS = {540: (3, 3, 10), 3000: (5, 5, 20), 7350: (7, 7, 25), 24000: (10, 10, 40), 98304: (16, 16, 64)}
 STEPS = {540: 300, 3000: 300, 7350: 150, 24000: 100}
 FIRST_STEPS = 100
+TITLE, PARTS = "A step on a CPU", ("schemes", "first", "threads", "transients")
 # CPU ms per step of the simulation thread measured for SOFA v17.06 with the logic of its asynchronous solver (2.5 GHz
 # Cascade Lake class, dgemm 1000 at 35 ms on one thread), and what we aimed at.
 SOFA = {540: 1.1, 3000: 5.95, 7350: 29.4, 24000: 134.0}
@@ -178,7 +181,7 @@ def measure(sizes: list[int], rounds: int, share: float) -> list[dict[str, Any]]
                 found[name].append(scheme(tets, steps))
         rows += [_row(tets, name, runs) for name, runs in found.items()]
         for row in rows[-len(SCHEMES) :]:
-            print({k: round(v, 3) if isinstance(v, float) else v for k, v in row.items()}, flush=True)
+            say(shown(row))
     return rows
 
 
@@ -217,20 +220,100 @@ def draw(report: Report, rows: list[dict[str, Any]]) -> None:
     report.figure(figure, "cpu.png", "Median CPU time of the simulation thread per step")
 
 
-def main() -> None:
+def thread_rows(sizes: list[int], threads: list[int], share: float) -> list[dict[str, Any]]:
+    """Rows of the steps of one body by the number of threads."""
+    rows: list[dict[str, Any]] = []
+    for tets in sizes:
+        scenes = {n: simulation(tets, f"solver.threads={n}") for n in threads}
+        rows += [{"tets": tets, **row} for row in several.measure(scenes, max(1, int(share * several.TURNS[tets])))]
+        for row in rows[-len(threads) :]:
+            say(shown(row))
+    return rows
+
+
+def usable(threads: list[int]) -> list[int]:
+    """Those for which this process has cores; says which are left out."""
+    cores = len(os.sched_getaffinity(0))
+    if more := [n for n in threads if n > cores]:
+        say(f"left out, with {cores} cores: {', '.join(map(str, more))} threads")
+    return [n for n in threads if n <= cores]
+
+
+def options() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n\n")[0])
-    parser.add_argument("--sizes", type=int, nargs="+", choices=list(CELLS), default=list(CELLS))
+    parser.add_argument("--sizes", type=int, nargs="+", choices=list(SOFA), default=list(SOFA))
     parser.add_argument("--rounds", type=int, default=3)
+    parser.add_argument("--threads", type=int, nargs="+", default=[1, 2, 4, 8, 12])
+    sizes = {"choices": list(several.TURNS), "default": [3000, 24000, 98304]}
+    parser.add_argument("--thread-sizes", type=int, nargs="+", **sizes)
+    parser.add_argument("--only", choices=PARTS, nargs="+", default=list(PARTS), help="parts of the page")
     parser.add_argument("--quick", action="store_true", help="smallest size, few steps, one round")
-    parser.add_argument("--out", type=Path)
-    options = parser.parse_args()
-    if options.quick:
-        options.sizes, options.rounds = [540], 1
-    report = Report(
-        "cpu", "A step on a CPU", {"sizes": options.sizes, "rounds": options.rounds}, options.out, options.quick
-    )
-    rows = measure(options.sizes, options.rounds, 0.1 if options.quick else 1.0)
-    report.data["rows"] = rows
+    arguments_of_pieces(parser)
+    o = parser.parse_args()
+    if o.quick:
+        o.sizes, o.rounds, o.thread_sizes = [540], 1, [540]
+    return o
+
+
+def main() -> None:
+    o = options()
+    if o.merge:
+        merged = Merged("cpu", TITLE, o.merge, o.out)
+        keys = {"rows": ("tets", "scheme"), "first steps": ("tets", "first_factor"), "threads": ("tets", "threads")}
+        keys["transients"] = ("tets", "threads", "factor")
+        merged.data |= {section: merged.rows(section, names) for section, names in keys.items()}
+        write(merged)
+        return
+    arguments: dict[str, Any] = {"only": o.only} if len(o.only) < len(PARTS) else {}
+    o.threads = usable(o.threads)
+    if "threads" in o.only:
+        arguments |= {"threads": o.threads, "thread sizes": o.thread_sizes}
+    if {"schemes", "first"} & set(o.only):
+        arguments |= {"sizes": o.sizes, "rounds": o.rounds}
+    report, share = Piece("cpu", TITLE, arguments, o.out, o.quick), 0.1 if o.quick else 1.0
+    if "threads" in o.only:
+        report.data["threads"] = thread_rows(o.thread_sizes, o.threads, share)
+        report.keep()
+    if "transients" in o.only:
+        tets, steps = (540, 64) if o.quick else (24000, 128)
+        report.data["transients"] = [row for n in {1, max(o.threads)} for row in transients.measure(tets, steps, n)]
+        for row in report.data["transients"]:
+            say(shown(row))
+        report.keep()
+    if "schemes" in o.only:
+        report.data["rows"] = measure(o.sizes, o.rounds, share)
+        report.keep()
+    if "first" in o.only:
+        steps = FIRST_STEPS // (5 if o.quick else 1)
+        report.data["first steps"] = [first_steps(max(o.sizes), way, steps) for way in ("wait", "go")]
+    write(report)
+
+
+def write(report: Report) -> None:
+    """The page of what was measured."""
+    if rows := report.data.get("rows"):
+        tell_schemes(report, rows)
+    if firsts := report.data.get("first steps"):
+        report.say(
+            "## The first steps",
+            f"The first {FIRST_STEPS} steps in real time with a worker process: the first one waits for the factor of "
+            "its own matrix, or all go (`[solver] first_factor`). *waited*: until that factor came, before the clock "
+            "starts; *s until the last*: all of it.",
+        )
+        report.table(firsts)
+    if threads := report.data.get("threads"):
+        report.remember(threads, ("tets", "threads"), ("ms p50", "p99"))
+        several.tell(report, threads)
+        several.draw(report, threads)
+    if old := report.data.get("transients"):
+        transients.tell(report, old)
+    if rows:
+        draw(report, rows)
+    report.write()
+
+
+def tell_schemes(report: Report, rows: list[dict[str, Any]]) -> None:
+    """Ours beside others."""
     ours = [row for row in rows if row["scheme"] == "async + warp"]
     report.remember(ours, ("tets",), ("CPU ms", "wall p50", "iterations"))
     report.say(
@@ -259,18 +342,6 @@ def main() -> None:
             for r in ours
         ]
     )
-    steps = FIRST_STEPS // (5 if options.quick else 1)
-    firsts = [first_steps(max(options.sizes), way, steps) for way in ("wait", "go")]
-    report.data["first steps"] = firsts
-    report.say(
-        "## The first steps",
-        f"The first {steps} steps in real time with a worker process: the first one waits for the factor of its "
-        "own matrix, or all go (`[solver] first_factor`). *waited*: until that factor came, before the clock starts; "
-        "*s until the last*: all of it.",
-    )
-    report.table(firsts)
-    draw(report, rows)
-    report.write()
 
 
 if __name__ == "__main__":

@@ -80,6 +80,15 @@ def searches(tets: int, o: argparse.Namespace) -> Rows:
     return found
 
 
+def trial(tets: int, o: argparse.Namespace) -> Rows:
+    """Row of what it takes to know that one linearization is enough."""
+    from tests.bench.gpu.trial import parts
+
+    found = parts(tets, 2 if o.quick else ROUNDS[tets], o.library, tuple(o.set))
+    print(found, flush=True)
+    return [found]
+
+
 def measure(o: argparse.Namespace) -> dict[str, Rows]:
     """All sections asked for, and what the device is."""
     from tests.bench.gpu.cudss import version
@@ -108,7 +117,9 @@ def measure(o: argparse.Namespace) -> dict[str, Rows]:
                 data["publishing"] += publishing
     for tets in o.sizes if "linearizations" in o.only else ():
         if tets in SEARCHED:
-            data["linearizations"] += guarded(f"{tets} tets", lambda: (searches(tets, o), []))[0]  # noqa: B023
+            made = guarded(f"{tets} tets", lambda: (searches(tets, o), trial(tets, o)))  # noqa: B023
+            data["linearizations"] += made[0]
+            data["trial"] += made[1]
     for section in page.KEYS:
         data[section] = [{"settings": " ".join(o.set), **row} for row in data[section]]
     return data
@@ -131,7 +142,11 @@ def merge(files: list[Path], out: Path | None) -> None:
     if several:
         report.say("Put together of several runs, the last one described above:")
         report.table(
-            [{**{k: part["header"][k] for k in ("date", "commit")}, **_words(part["arguments"])} for part in parts]
+            [
+                {**{k: part["header"][k] for k in ("date", "commit")}, "gpu": part["data"]["device"]["gpu"]}
+                | _words(part["arguments"])
+                for part in parts
+            ]
         )
     page.write(report, page.merged([part["data"] for part in parts]))
 

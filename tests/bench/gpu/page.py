@@ -15,6 +15,7 @@ KEYS = {  # what tells rows of a section apart
     "served": ("tets", "material", "worker", "settings"),
     "publishing": ("tets", "material", "matrices", "settings"),
     "linearizations": ("tets", "tolerance", "linearizations", "needed", "settings"),
+    "trial": ("tets", "settings"),
 }
 
 PROBLEM = (
@@ -58,6 +59,14 @@ SEARCHED = (
 PUBLISHED = "In turns; the factor stays the same, what the worker (on the CPU) sends back is thrown away."
 
 
+TRIED = (
+    "Of the step that may have four linearizations, needs one and solves it to 1e-6, p50: what it takes to know that "
+    "one is enough. Forces: what the kernels over elements and nodes of the first assembly take when they are launched "
+    "once more. Loop: with it, less without it. The rest: the state at the end, its judgement, the way back. The last "
+    "column: at best, if the next step got its forces for nothing, which it can where nothing changes in between."
+)
+
+
 def merged(parts: list[Data]) -> Data:
     """One set of rows of several runs; where two have the same row, that of the later one. device: of the last."""
     direct = [part["device"]["cuDSS"] for part in parts if part["device"]["cuDSS"] != "absent"]
@@ -92,6 +101,9 @@ def write(report: Report, data: Data) -> None:
         report.say("## Several linearizations", SEARCHED)
         rows = [_beside_one(row, data["linearizations"]) for row in data["linearizations"]]
         report.table(rows, _columns(rows))
+    if data["trial"]:
+        report.say(TRIED)
+        report.table(data["trial"], _columns(data["trial"]))
     report.write()
 
 

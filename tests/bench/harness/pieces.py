@@ -57,7 +57,7 @@ def _told(part: Row) -> Row:
     header, words = part["header"], {}
     for name, value in part["arguments"].items():
         words[name] = " ".join(map(str, value)) if isinstance(value, list) else str(value)
-    where = {"cpu": header["machine"]["cpu"], "cores": header["machine"]["cores"]}
+    where = {name: header["machine"].get(name) for name in ("cpu", "cores", "gpu", "load")}
     return {**{k: header[k] for k in ("date", "commit")}, **where, **words}
 
 

@@ -112,9 +112,8 @@ static void solve_islands(Loop& loop, bool resumes) {
     for (int i = 0; i < c.islands; ++i)
         if (size(i) > 1 && wanted(i)) solve_island(loop, i, resumes);
     if (resumes && !c.own.near.start) return;
-#pragma omp parallel for num_threads(loop.threads) schedule(dynamic, 1) if (loop.threads > 1)
-    for (int i = 0; i < c.islands; ++i)
-        if (size(i) == 1 && wanted(i)) solve_island(loop, i, resumes);
+    each_about_a_body(loop, c.islands, [&](int i) { return c.island[c.island_start[i]]; },
+                      [&](int i) { if (size(i) == 1 && wanted(i)) solve_island(loop, i, resumes); });
 }
 
 // Solves all bodies whose step is not made. Those that pass through each other then get rows where they do, and are solved again. True

@@ -54,12 +54,21 @@ struct CutSolve {
             mark(since);
             if (!c.wanted) return;
             if (rings) widen();
+            const double blocks = A.row_start[A.last] - A.row_start[A.first];
             sort();
-            if (!assemble()) continue;
+            if (!assemble(ENOUGH_FOR_CUTS * 9 * blocks)) continue;
             if (factorize()) c.count = c.wanted;
             break;
         }
         if (c.copies && !c.count) invert_groups();
+    }
+
+    // Makes S on the nodes marked -2 in `place`. False if it takes more than `most` multiplications or is not positive definite.
+    bool make(double most) {
+        c.count = c.gone = c.copies = c.groups = 0;
+        sort();
+        if (assemble(most) && factorize()) c.count = c.wanted;
+        return c.count > 0;
     }
 
     bool works() const { return c.count > 0 || c.gone > 0 || c.copies > 0; }
@@ -193,8 +202,8 @@ private:
         for (int k = 0; k < found; ++k) c.place[c.node[k]] = k;
     }
 
-    // Copies A on T into the envelope; false if it is too large.
-    bool assemble() {
+    // Copies A on T into the envelope; false if it is too large, or its factorization takes more than `most` multiplications.
+    bool assemble(double most) {
         int64_t at = 0;
         double work = 0;
         for (int k = 0; k < c.wanted; ++k) {
@@ -207,8 +216,7 @@ private:
                 work += (double)(3 * (k - least) + m + 1) * (3 * (k - least) + m + 1);
             }
         }
-        const double blocks = A.row_start[A.last] - A.row_start[A.first];
-        if (at > c.capacity || work > ENOUGH_FOR_CUTS * 9 * blocks) return false;
+        if (at > c.capacity || work > most) return false;
         std::fill(c.envelope, c.envelope + at, 0);
         for (int k = 0; k < c.wanted; ++k)
             each_block(c.node[k], [&](int j, const double* a) {

@@ -6,8 +6,6 @@
 
 #include "loop.h"
 
-static void run(const Launch& l, int threads);
-
 // Sums over a body's nodes. keeps: what pushes and grabs exert stays, for another call.
 static Sums sums_of(const Loop& loop, const Body& body, bool keeps = false) {
     Energies& e = *loop.energies;
@@ -94,15 +92,14 @@ static void freeze(const Loop& loop, const Body& body) {
 // Updates all balances after a step. elastic: evaluate the elastic energy, too.
 static void account(Loop& loop, bool elastic) {
     Energies& e = *loop.energies;
-#pragma omp parallel for num_threads(loop.threads) schedule(dynamic, 1) if (loop.threads > 1 && loop.bodies > 1)
-    for (int i = 0; i < loop.bodies; ++i) {
+    Team::each(loop.threads, loop.bodies, [&](int i) {
         Balance& b = e.balance[i];
         const double limit = b.limit;
         if (loop.halving && loop.halving->made[i]) b.limit = INFINITY;  // short steps make it up
         const bool frozen = update_balance(b, sums_of(loop, loop.body[i]), e.on_runaway, e.inertia);
         b.limit = limit;
         if (frozen) freeze(loop, loop.body[i]);
-    }
+    });
     if (elastic) measure_elastic(loop);
     for (int i = 0; i < loop.bodies; ++i)
         if (!elastic || e.balance[i].found) e.balance[i].elastic = NAN;

@@ -119,17 +119,16 @@ static void look_for_touch(Loop& loop) {
     EulerForm& e = *loop.euler;
     Contact& c = *loop.contact;
     single_islands(loop);
-#pragma omp parallel for num_threads(loop.threads) schedule(dynamic, 1) if (loop.threads > 1)
-    for (int i = 0; i < loop.bodies; ++i) {
+    Team::each(loop.threads, loop.bodies, [&](int i) {
         c.report[i] = {0, 0, 0, NAN, 0};
         std::fill_n(c.reaction + 6 * (int64_t)c.obstacle_count * i, 6 * c.obstacle_count, 0.0);
-        if (e.takes[i]) continue;
+        if (e.takes[i]) return;
         Passes p(loop, i);
         p.choose_set();
         p.move_points();
         const bool acts = p.apply_law(false);
         e.takes[i] = sweep_obstacles(p) || acts;
-    }
+    });
 }
 
 // --- the step -----------------------------------------------------------------------------------------------------------------------
@@ -169,17 +168,16 @@ static void make_own_step(Loop& loop) {
     EulerForm& e = *loop.euler;
     auto own = [&](int i) { return !e.takes[i]; };
     if (loop.newton) search_all(loop);
-#pragma omp parallel for num_threads(loop.threads) schedule(dynamic, 1) if (loop.threads > 1 && loop.bodies > 1)
-    for (int i = 0; i < loop.bodies; ++i) {
+    each_body(loop, [&](int i) {
         Body& body = loop.body[i];
         const int64_t at = 3 * (int64_t)body.first;
         e.result[i] = SolveResult{0, 0, 0, CONVERGED, body.now.kind, 0};
-        if (!own(i)) continue;
+        if (!own(i)) return;
         if (loop.newton) e.result[i] = as_solve_result(loop.newton->search[i]);
         else
             e.result[i] = pcg(matrix_of(loop, body), loop.b + at, body.factor, body.now, loop.y + at, loop.work + WORK * (int64_t)body.first,
                               !loop.moving[i], &body.correction);
-    }
+    });
     for (int k = loop.before; k < loop.launches; ++k) run_for(loop, loop.launch[k], own);
 }
 

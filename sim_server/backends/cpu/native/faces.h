@@ -98,8 +98,7 @@ struct FaceDetection {
 
     // Sets the rows of a step.
     void run() const {
-#pragma omp parallel for num_threads(loop.threads) schedule(dynamic, 1) if (loop.threads > 1)
-        for (int i = 0; i < loop.bodies; ++i) detect(i);
+        Team::each(loop.threads, loop.bodies, [&](int i) { detect(i); });
     }
     void detect(int body) const {
         const BodyFaces faces(loop, c, motion_of(c, loop.x, nullptr), body);

@@ -88,8 +88,7 @@ struct IslandSolver {
     }
     // The same, bodies side by side: f writes what is its body's alone.
     template <class F> void beside(F f) const {
-#pragma omp parallel for num_threads(loop.threads) schedule(dynamic, 1) if (loop.threads > 1)
-        for (int m = 0; m < count; ++m) f(loop.body[bodies[m]], m);
+        each_about_a_body(loop, count, [&](int m) { return bodies[m]; }, [&](int m) { f(loop.body[bodies[m]], m); });
     }
     // Sum of f(body, number), in the order of the bodies whatever the number of threads.
     template <class F> double sum_of(F f) const {
@@ -470,7 +469,7 @@ struct IslandSolver {
             const double alpha = zr / pq;
             r2 = sum_of([&](const Body& body, int) {
                 const int64_t at = 3 * (int64_t)body.first;
-                return descend((int)(3 * (int64_t)(body.last - body.first)), alpha, p + at, q + at, x + at, r + at);
+                return descend(matrix_of(loop, body), alpha, p + at, q + at, x + at, r + at);
             });
             error.move(alpha);
             const bool enough = is_enough(true);

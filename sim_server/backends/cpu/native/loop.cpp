@@ -49,17 +49,6 @@ static void take_changes(Loop& loop) {
     next->taken.store(loop.rings.step, std::memory_order_release);
 }
 
-static void run(const Launch& l, int threads) {
-    const int64_t items = l.binding->items, grain = 512;
-    int parts = (int)(items / grain < threads ? items / grain : threads);
-    if (parts < 2) {
-        if (items > 0) l.kernel(l.binding->params, 0, (int)items);
-        return;
-    }
-#pragma omp parallel for num_threads(parts) schedule(static, 1)
-    for (int k = 0; k < parts; ++k) l.kernel(l.binding->params, (int)(items * k / parts), (int)(items * (k + 1) / parts));
-}
-
 // Linearizes, solves and tries until the search of every body is over; then y is the whole change of velocity. Bodies that take backward
 // Euler have none.
 static void search_all(Loop& loop) {
@@ -80,13 +69,12 @@ static void search_all(Loop& loop) {
     auto searching = [&](int i) { return loop.newton->search[i].phase != DONE; };
     for (bool left = true; left;) {
         double t = now();
-#pragma omp parallel for num_threads(loop.threads) schedule(dynamic, 1) if (loop.threads > 1 && loop.bodies > 1)
-        for (int i = 0; i < loop.bodies; ++i) solve(loop, i);
+        each_body(loop, [&](int i) { solve(loop, i); });
         solving += now() - t;
         newton.forces_seconds = launch(0, searching);
+        each_body(loop, [&](int i) { judge(loop, i); });
         left = false;
-#pragma omp parallel for num_threads(loop.threads) schedule(dynamic, 1) reduction(|| : left) if (loop.threads > 1 && loop.bodies > 1)
-        for (int i = 0; i < loop.bodies; ++i) left = judge(loop, i) != DONE || left;
+        for (int i = 0; i < loop.bodies; ++i) left = left || searching(i);
         auto linearizes = [&](int i) { return newton.search[i].phase == SOLVE; };
         bool more = false;
         for (int i = 0; i < loop.bodies; ++i) more = more || linearizes(i);
@@ -108,11 +96,16 @@ static void take_orders(Body& body) {
     take_factor(body);
 }
 
+constexpr int64_t COPIED = 4096;  // blocks, whose copy takes longer than to share it out
+
 // Copies A of a body as a factor is to know it, with contacts. Where steps may be made by the factor alone it is that of the scheme,
 // without contacts, but for bodies that touch something for long.
 static void copy_matrix(const Loop& loop, const Body& body, double* target) {
     const int64_t begin = loop.row_start[body.first], end = loop.row_start[body.last];
-    std::memcpy(target, loop.values + 9 * begin, 9 * sizeof(double) * (end - begin));
+    Team::run((int)std::min<int64_t>(loop.threads, 1 + (end - begin) / COPIED), [&](int k, int parts) {
+        const int64_t first = (end - begin) * k / parts, last = (end - begin) * (k + 1) / parts;
+        std::memcpy(target + 9 * first, loop.values + 9 * (begin + first), 9 * sizeof(double) * (last - first));
+    });
     if (!loop.contact) return;
     const int index = (int)(&body - loop.body);
     const bool of_euler = loop.euler && copied_as_of_euler(loop, index);
@@ -126,6 +119,7 @@ static void copy_for_worker(Loop& loop, Body& body) {
     const int64_t index = &body - loop.body;
     const bool assembled = loop.stages ? loop.stages->state[index].assembled : !loop.euler || loop.euler->assembled[index];
     if (body.ahead < 0 && !assembled) return;  // in the next step
+    if (assembled) note_diagonal(body.correction.known, matrix_of(loop, body), loop.rings.step);
     if (body.ahead < 0) {
         copy_matrix(loop, body, target);
     } else {
@@ -281,8 +275,7 @@ static void finish_step(Loop* loop) {
     else if (loop->newton && loop->contact) search_in_contact(*loop);
     else if (loop->newton) search_all(*loop);
     else if (loop->contact) solve_in_contact(*loop);
-#pragma omp parallel for num_threads(loop->threads) schedule(dynamic, 1) if (loop->threads > 1 && loop->bodies > 1)
-    for (int i = 0; i < loop->bodies; ++i) {
+    each_body(*loop, [&](int i) {
         Body& body = loop->body[i];
         const SolveSettings& settings = body.now;
         int linearizations = 1;
@@ -305,7 +298,7 @@ static void finish_step(Loop* loop) {
                     loop->work + WORK * (int64_t)body.first, !loop->moving[i], &body.correction);
         }
         ++body.steps;
-        if (!keep) continue;
+        if (!keep) return;
         Record& record = rings.records[(first + i) % rings.record_capacity];
         bool used = body.factor && (settings.kind == CHOLESKY || r.kind == CHOLESKY || r.fallbacks);
         record = make_record(rings, step, i, r);
@@ -323,10 +316,10 @@ static void finish_step(Loop* loop) {
         if (loop->contact) note_contact(*loop, i, (first + i) % rings.record_capacity);
         if (loop->substeps) note_substeps(*loop->substeps, i, record);
         if (loop->euler && loop->euler->takes[i]) record.form = EULER;
-        if (!loop->stages) continue;
+        if (!loop->stages) return;
         record.form = loop->stages->state[i].form;
         record.estimate = loop->stages->state[i].estimate;
-    }
+    });
     double solved = now();
     for (int i = loop->before; i < loop->launches && !loop->euler; ++i) run(loop->launch[i], loop->threads);
     if (loop->halving) halve_steps(*loop);
@@ -377,6 +370,10 @@ void wf_solve(Loop* loop) {
     if (loop->energies) leave(*loop);
 }
 
+// Has the loop know of what matrix a factor will be made.
+void wf_note_matrix(Loop* loop, int32_t body) {
+    note_diagonal(loop->body[body].correction.known, matrix_of(*loop, loop->body[body]), loop->rings.step);
+}
 void wf_copy_matrix(Loop* loop, int32_t body, double* target) { copy_matrix(*loop, loop->body[body], target); }
 int32_t wf_wait(Loop* loop) { return wait_until_due(loop->rings, [] { return false; }); }
 
@@ -406,10 +403,26 @@ Changes* wf_post_changes(Loop* loop, Changes* changes) { return loop->changes.ex
 Binding* wf_post_binding(Launch* launch, Binding* binding) { return launch->mail.exchange(binding); }
 
 // One application of a factor, z = P^-1 r. A probe for tests and benchmarks.
-void wf_apply_factor(const Factor* factor, const double* r, double* z, double* work) {
-    if (factor->bytes == 4) apply_factor(*factor->pattern, (const float*)factor->values, r, 1, z, (float*)work);
-    else apply_factor(*factor->pattern, (const double*)factor->values, r, 1, z, work);
+void wf_apply_factor(const Factor* factor, const double* r, double* z, double* work, int32_t threads) {
+    auto apply = [&](auto* values, auto* room) {
+        using T = std::remove_pointer_t<decltype(room)>;
+        if (FactorPlan* plan = factor->pattern->plan) apply_factor(*plan, values, r, 1, z, threads, true, [](T*) {});
+        else apply_factor(*factor->pattern, values, r, 1, z, room);
+    };
+    if (factor->bytes == 4) apply((const float*)factor->values, (float*)work);
+    else apply((const double*)factor->values, work);
 }
+
+// How `threads` share the solves of factors of a pattern; null where they cannot (factor_plan.h) or without memory.
+FactorPlan* wf_plan(const Pattern* pattern, int32_t threads) {
+    try {
+        auto plan = std::make_unique<FactorPlan>(*pattern, threads);
+        return plan->make() ? plan.release() : nullptr;
+    } catch (const std::bad_alloc&) {
+        return nullptr;
+    }
+}
+void wf_delete_plan(FactorPlan* plan) { delete plan; }
 
 // The same of what a solve of a body with its factor would use now, corrected for changes of the diagonal. A probe for tests.
 // work: 2 n doubles.

@@ -229,5 +229,43 @@ struct Loop {
 };
 
 static BlockCsr matrix_of(const Loop& loop, const Body& body) {
-    return {body.first, body.last, loop.row_start, loop.columns, loop.values, nullptr, loop.rank_one, (int)(&body - loop.body)};
+    return {body.first, body.last, loop.row_start, loop.columns, loop.values, nullptr, loop.rank_one, (int)(&body - loop.body), loop.threads};
 }
+
+// f(number) for [0, count), of which each is about one body: those with much of all the nodes come one after another, as what is done
+// for them is itself shared out between threads, and then the others side by side.
+template <class B, class F> static void each_about_a_body(const Loop& loop, int count, B body_of, F f) {
+    if (loop.threads < 2 || count < 2) {
+        for (int k = 0; k < count; ++k) f(k);
+        return;
+    }
+    auto is_large = [&](int k) {
+        const Body& body = loop.body[body_of(k)];
+        const int nodes = body.last - body.first;
+        return nodes >= 2 * NODES_OF_A_THREAD && (int64_t)nodes * loop.threads >= loop.nodes;
+    };
+    bool small = false;
+    for (int k = 0; k < count; ++k) {
+        if (is_large(k)) f(k);
+        else small = true;
+    }
+    if (!small) return;
+    Team::each(loop.threads, count, [&](int k) { if (!is_large(k)) f(k); });
+}
+template <class F> static void each_body(const Loop& loop, F f) {
+    each_about_a_body(loop, loop.bodies, [](int k) { return k; }, f);
+}
+
+// Runs a launch for the items [first, last).
+static void run_items(const Launch& l, int64_t first, int64_t last, int threads) {
+    const int64_t items = last - first, grain = 256;
+    int parts = (int)(items / grain < threads ? items / grain : threads);
+    if (parts < 2) {
+        if (items > 0) l.kernel(l.binding->params, (int)first, (int)last);
+        return;
+    }
+    Team::run(parts, [&](int k, int parts) {
+        l.kernel(l.binding->params, (int)(first + items * k / parts), (int)(first + items * (k + 1) / parts));
+    });
+}
+static void run(const Launch& l, int threads) { run_items(l, 0, l.binding->items, threads); }

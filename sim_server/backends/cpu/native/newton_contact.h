@@ -200,9 +200,7 @@ template <class F> static void each_island(Loop& loop, F f) {
     auto size = [&](int i) { return c.island_start[i + 1] - c.island_start[i]; };
     for (int i = 0; i < c.islands; ++i)
         if (size(i) > 1) f(i);
-#pragma omp parallel for num_threads(loop.threads) schedule(dynamic, 1) if (loop.threads > 1)
-    for (int i = 0; i < c.islands; ++i)
-        if (size(i) == 1) f(i);
+    each_about_a_body(loop, c.islands, [&](int i) { return c.island[c.island_start[i]]; }, [&](int i) { if (size(i) == 1) f(i); });
 }
 
 // Searches until all islands are done, and takes the bodies back to the start of the step; y is then the whole change of velocity.

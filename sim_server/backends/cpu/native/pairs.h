@@ -37,19 +37,17 @@ struct PairDetection {
             for (int j = 0; j < i; ++j)
                 if (c.between && meet(c.body_box[i], c.body_box[j])) c.near[i] = c.near[j] = 1;
         find_own(before);
-#pragma omp parallel for num_threads(loop.threads) schedule(dynamic, 1) if (loop.threads > 1)
-        for (int i = 0; i < loop.bodies; ++i)
-            if (c.near[i]) {
-                fit_tree(tables, motion, i);
-                for (int edge = edges_before(i); edge < edges_before(i + 1); ++edge) fit_wings(edges, motion, edge);
-            }
+        Team::each(loop.threads, loop.bodies, [&](int i) {
+            if (!c.near[i]) return;
+            fit_tree(tables, motion, i);
+            for (int edge = edges_before(i); edge < edges_before(i + 1); ++edge) fit_wings(edges, motion, edge);
+        });
     }
 
     // Finds the bodies that may touch themselves.
     void find_own(bool before) const {
         if (!own.exists()) return;
-#pragma omp parallel for num_threads(loop.threads) schedule(dynamic, 1) if (loop.threads > 1)
-        for (int i = 0; i < loop.bodies; ++i) {
+        Team::each(loop.threads, loop.bodies, [&](int i) {
             if (!before) own.add_ways(i);
             bool may = before ? own.begin(i) : own.any_may_pass(i);
             if (before && may && own.wants_reference(i)) {
@@ -58,7 +56,7 @@ struct PairDetection {
                 may = own.any_may_touch(i, 2);
             }
             if (may) c.near[i] |= MAY_TOUCH_ITSELF;
-        }
+        });
     }
     // Sets the rows that a site may have with its own body, too.
     void detect_site_and_own(int body, int site) const {
@@ -81,15 +79,14 @@ struct PairDetection {
     // Sets the rows of a step.
     void run() const {
         fit(true);
-#pragma omp parallel for num_threads(loop.threads) schedule(dynamic, 1) if (loop.threads > 1)
-        for (int i = 0; i < loop.bodies; ++i) {
-            if (!c.near[i] && !c.was_near[i]) continue;
+        Team::each(loop.threads, loop.bodies, [&](int i) {
+            if (!c.near[i] && !c.was_near[i]) return;
             for (int site = sites_before(tables, i); site < sites_before(tables, i + 1); ++site) detect_site_and_own(i, site);
             for (int edge = edges_before(i); edge < edges_before(i + 1); ++edge) {
                 if (!c.near[i]) c.wings[edge].sharp = 0;
                 count_dropped(edge, detect_edge(tables, edges, motion, i, edge, own_edges(i, edge)));
             }
-        }
+        });
         std::copy(c.near, c.near + loop.bodies, c.was_near);
     }
 
@@ -101,11 +98,12 @@ struct PairDetection {
         fit();
         double* farthest = room + 3 * (int64_t)loop.nodes;
         const Motion ended = arrived(room, farthest);
-        bool found = false;
-#pragma omp parallel for num_threads(loop.threads) schedule(dynamic, 1) reduction(|| : found) if (loop.threads > 1)
-        for (int i = 0; i < loop.bodies; ++i)
+        std::atomic<bool> passes{false};
+        Team::each(loop.threads, loop.bodies, [&](int i) {
             for (int site = sites_before(tables, i); c.near[i] && site < sites_before(tables, i + 1); ++site)
-                found = sweep_site(site, ended, detected ? farthest : nullptr) || found;
+                if (sweep_site(site, ended, detected ? farthest : nullptr)) passes.store(true, std::memory_order_relaxed);
+        });
+        bool found = passes;
         for (int i = 0; i < loop.bodies; ++i)
             for (int edge = edges_before(i); c.near[i] && edge < edges_before(i + 1); ++edge) found = sweep_edge(i, edge) || found;
         // rows of this step, whether found before the solve or here, count in its islands and are looked at again in the next one

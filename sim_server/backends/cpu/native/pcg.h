@@ -16,6 +16,7 @@
 // An iteration is one application of A after the initial residual.
 #pragma once
 #include "bsr.h"
+#include "factor_sweeps.h"
 #include "iterate_error.h"
 #include "kinds.h"
 #include "ring_buffers.h"
@@ -68,44 +69,50 @@ struct Preconditioner {
     void* work;       // 2 n doubles
     double omega;
     Correction* correction = nullptr;
-    bool corrects = false, cut = false;
+    bool corrects = false;
+    CutNodes* around = nullptr;  // nodes on which it is exact
 
     void prepare() {
-        cut = kind == CHOLESKY && correction && correction->cut && is_cut();
+        around = kind == CHOLESKY && correction && correction->cut && is_cut() ? correction->cut : nullptr;
         corrects = kind == CHOLESKY && correction && correction->capacity && Corrected{*correction, A, *factor}.prepare();
         if (kind == JACOBI || kind == BLOCK_JACOBI || kind == SSOR) invert_diagonal(A, kind != JACOBI, inverse);
     }
     // z = P^-1 r; returns z . r
     double apply(const double* r, double r_norm, double* z) {
         int n = A.size();
-        if (kind == CHOLESKY && factor->bytes == 4)
-            with_factor<float>(r, r_norm, z);
-        else if (kind == CHOLESKY)
-            with_factor<double>(r, r_norm, z);
-        else if (kind == SSOR)
-            apply_ssor(A, inverse, omega, r, z);
-        else if (kind == NONE)
-            for (int i = 0; i < n; ++i) z[i] = r[i];
-        else
-            apply_diagonal(n / 3, inverse, r, z);
-        return dot(n, z, r);
+        if (kind == CHOLESKY && factor->bytes == 4) return with_factor<float>(r, r_norm, z);
+        if (kind == CHOLESKY) return with_factor<double>(r, r_norm, z);
+        if (kind == JACOBI || kind == BLOCK_JACOBI) return apply_diagonal(A, inverse, r, z);
+        if (kind == SSOR) apply_ssor(A, inverse, omega, r, z);
+        else std::copy(r, r + n, z);
+        return dot(A, z, r);
     }
     bool is_cut() {
-        CutSolve around{*correction->cut, A};
-        around.prepare(factor->step);
-        return around.works();
+        CutSolve solve{*correction->cut, A};
+        solve.prepare(factor->step);
+        return solve.works();
+    }
+    // Makes it exact where A has changed most since the factor's matrix (local_refresh.h); false if that cannot be.
+    bool refresh_locally() {
+        if (around || !correction) return false;
+        const double numbers = entries_of(*factor->pattern) + 9.0 * (A.row_start[A.last] - A.row_start[A.first]);
+        if (!refresh(correction->known, A, factor->step, numbers)) return false;
+        around = correction->known->room;
+        return true;
     }
     template <class T>
-    void with_factor(const double* r, double r_norm, double* z) {
-        if (!cut) return apply_alone<T>(r, r_norm, z);
-        CutSolve{*correction->cut, A}.around(r, z, [&](const double* from, double* to) { apply_alone<T>(from, r_norm, to); });
+    double with_factor(const double* r, double r_norm, double* z) {
+        if (!around) return apply_alone<T>(r, r_norm, z);
+        CutSolve{*around, A}.around(r, z, [&](const double* from, double* to) { apply_alone<T>(from, r_norm, to); });
+        return dot(A, z, r);
     }
     template <class T>
-    void apply_alone(const double* r, double r_norm, double* z) {
+    double apply_alone(const double* r, double r_norm, double* z) {
         const T* values = (const T*)factor->values;
-        auto correct = [&](T* y) { Corrected{*correction, A, *factor}.between(y); };
-        if (corrects) apply_factor(*factor->pattern, values, r, 1 / r_norm, z, (T*)work, correct);
-        else apply_factor(*factor->pattern, values, r, 1 / r_norm, z, (T*)work);
+        auto correct = [&](T* y) { if (corrects) Corrected{*correction, A, *factor}.between(y); };
+        if (FactorPlan* plan = factor->pattern->plan) return apply_factor(*plan, values, r, 1 / r_norm, z, A.parts(), !corrects, correct);
+        apply_factor(*factor->pattern, values, r, 1 / r_norm, z, (T*)work, correct);
+        return dot(A, z, r);
     }
 };
 
@@ -128,7 +135,7 @@ static SolveResult pcg(const BlockCsr& A, const double* b, const Factor* factor,
     };
     auto zero = [&] { for (int i = 0; i < n; ++i) x[i] = 0; };
 
-    double b2 = dot(n, b, b);
+    double b2 = dot(A, b, b);
     if (!std::isfinite(b2)) {
         for (int i = 0; i < n; ++i) x[i] = NAN;  // the kernel `advance` takes the body back
         return finish(NOT_FINITE, b2, 1);
@@ -149,10 +156,12 @@ static SolveResult pcg(const BlockCsr& A, const double* b, const Factor* factor,
 
     Preconditioner P{A, factor, out.kind, inverse, scratch, settings.omega, correction};
     P.prepare();
+    if (correction && correction->known) correction->known->refreshed = 0;
     const double useful = bounded ? std::max(goal, USEFUL * USEFUL * b2) : goal;
     const double limit = settings.residual_limit > 0 ? settings.residual_limit * settings.residual_limit * b2 : INFINITY;
     double rz = 0, last_true = INFINITY, quarter = r2 * std::pow(useful / r2, 0.25);
-    bool restart = true, switched = false, applied = from == APPLIED_START;
+    const double first_r2 = r2;
+    bool restart = true, switched = false, refreshed = false, applied = from == APPLIED_START;
     auto leave_factor = [&] {
         P.kind = out.kind = BLOCK_JACOBI;
         out.fallbacks = 1;
@@ -163,6 +172,11 @@ static SolveResult pcg(const BlockCsr& A, const double* b, const Factor* factor,
     // Whether a solve ends by the estimate. ahead: z is of the iteration before.
     auto is_enough = [&](bool ahead) {
         return bounded && r2 <= limit && may_end(out.kind, r2, b2) && error.is_enough(settings.dx_dv, trust_of(out.kind, settings.trust), settings.position, r2, ahead);
+    };
+    // Whether a solve with a factor has far to go: then the factor is refreshed where A has changed most.
+    auto is_slow = [&] {
+        if (refreshed || P.kind != CHOLESKY || out.iterations != REFRESH_AFTER || bounded) return false;
+        return !(REFRESH_AFTER * std::log(r2 / goal) < REFRESH_WORTH * std::log(first_r2 / r2));
     };
     // The status with which the solve ends by its true residual, -1: it goes on from it.
     auto ended = [&](bool enough) {
@@ -175,7 +189,7 @@ static SolveResult pcg(const BlockCsr& A, const double* b, const Factor* factor,
         return -1;
     };
     for (;;) {
-        double zr = applied ? dot(n, z, r) : P.apply(r, std::sqrt(r2), z);       // 1. 6. z = P^-1 r
+        double zr = applied ? dot(A, z, r) : P.apply(r, std::sqrt(r2), z);       // 1. 6. z = P^-1 r
         applied = false;
         if (!(zr > 0 && zr < INFINITY)) {                                        // also NaN
             if (P.kind != CHOLESKY) return finish(BREAKDOWN_PRECONDITIONER, residual(A, b, x, r), b2);
@@ -189,7 +203,7 @@ static SolveResult pcg(const BlockCsr& A, const double* b, const Factor* factor,
             if (status >= 0) return finish(status, r2, b2);
             continue;
         }
-        conjugate(n, restart ? 0 : zr / rz, z, p);                               // 7. 8. p = z + beta p
+        conjugate(A, restart ? 0 : zr / rz, z, p);                               // 7. 8. p = z + beta p
         rz = zr;
         restart = false;
         if (out.iterations == settings.max_iterations) return finish(MAX_ITERATIONS, residual(A, b, x, r), b2);
@@ -213,10 +227,16 @@ static SolveResult pcg(const BlockCsr& A, const double* b, const Factor* factor,
         double pq = multiply(A, p, q);
         ++out.iterations;
         if (!(pq > 0)) return finish(BREAKDOWN_MATRIX, residual(A, b, x, r), b2);
-        r2 = descend(n, rz / pq, p, q, x, r);                                    // 3. 4. 5.
+        r2 = descend(A, rz / pq, p, q, x, r);                                    // 3. 4. 5.
         error.move(rz / pq);
         const bool enough = is_enough(true);
-        if (r2 > goal && !enough) continue;
+        if (r2 > goal && !enough) {
+            if (is_slow() && P.refresh_locally()) {
+                refreshed = restart = true;
+                error.forget();
+            }
+            continue;
+        }
         const int status = ended(enough);
         if (status >= 0) return finish(status, r2, b2);
     }
@@ -227,7 +247,7 @@ static double apply_to(const BlockCsr& A, const double* b, const Factor* factor,
                        Correction* correction) {
     const int n = A.size();
     double *r = work, *z = r + n, *inverse = z + 3 * n, *scratch = inverse + 3 * n;
-    const double norm = std::sqrt(dot(n, b, b));
+    const double norm = std::sqrt(dot(A, b, b));
     std::copy(b, b + n, r);
     if (norm == 0) return 0;
     Preconditioner P{A, factor, kind, inverse, scratch, omega, correction};

@@ -15,9 +15,10 @@ template <class F> static void run_for(const Loop& loop, const Launch& l, F take
     for (int i = 0; i < loop.bodies; ++i) left += take_part(i);
     if (!left) return;
     if (!l.parts || left == loop.bodies) { run(l, loop.threads); return; }
-#pragma omp parallel for num_threads(loop.threads) schedule(dynamic, 1) if (loop.threads > 1 && left > 1)
-    for (int i = 0; i < loop.bodies; ++i)
-        if (take_part(i) && l.parts[i] < l.parts[i + 1]) l.kernel(l.binding->params, l.parts[i], l.parts[i + 1]);
+    each_body(loop, [&](int i) {
+        if (!take_part(i) || l.parts[i] >= l.parts[i + 1]) return;
+        run_items(l, l.parts[i], l.parts[i + 1], loop.threads);
+    });
 }
 
 static bool copy_wanted(const Body& body) { return body.snapshot.load(std::memory_order_acquire) && body.ahead < 0; }
@@ -170,16 +171,15 @@ static void iterate(Loop& loop, int index, bool first) {
 
 // Solves of the bodies that take part. first: of the first stage.
 template <class F> static void solve_stage(Loop& loop, bool first, F take_part) {
-#pragma omp parallel for num_threads(loop.threads) schedule(dynamic, 1) if (loop.threads > 1 && loop.bodies > 1)
-    for (int i = 0; i < loop.bodies; ++i) {
+    each_body(loop, [&](int i) {
         StageState& s = loop.stages->state[i];
-        if (!take_part(i) || s.form == FAILED) continue;
-        if (!loop.moving[i] && s.form != EULER) { s.result.kind = loop.body[i].now.kind; continue; }
-        if (s.form != FACTOR) { iterate(loop, i, first); continue; }
-        if (apply_alone(loop, i, first)) continue;
+        if (!take_part(i) || s.form == FAILED) return;
+        if (!loop.moving[i] && s.form != EULER) { s.result.kind = loop.body[i].now.kind; return; }
+        if (s.form != FACTOR) { iterate(loop, i, first); return; }
+        if (apply_alone(loop, i, first)) return;
         s.patience = PATIENCE;
         s.form = FAILED;
-    }
+    });
 }
 
 // One attempt of the bodies that take part, from the first solve on. Returns whether one has to make another.

@@ -6,6 +6,8 @@
 #pragma once
 #include <cstdint>
 
+struct FactorPlan;
+
 struct Pattern {
     int32_t size;                // degrees of freedom
     int32_t supernodes;
@@ -14,7 +16,15 @@ struct Pattern {
     const int64_t* row_start;    // (supernodes + 1,) into rows
     const int32_t* rows;
     const int64_t* value_start;  // (supernodes,) into the values
+    FactorPlan* plan;            // how threads share the solves (factor_plan.h); null: one does all
 };
+
+// Number of values of L.
+static double entries_of(const Pattern& p) {
+    const int last = p.supernodes - 1;
+    const double w = p.super_start[last + 1] - p.super_start[last], h = (double)(p.row_start[last + 1] - p.row_start[last]);
+    return (double)p.value_start[last] + w * h - w * (w - 1) / 2;
+}
 
 template <class T>
 struct Panel {

@@ -19,6 +19,7 @@
 
 #include "bsr.h"
 #include "cut_nodes.h"
+#include "local_refresh.h"
 #include "supernodal.h"
 
 struct Factor {
@@ -74,6 +75,7 @@ struct Correction {
     double *touch_now, *touch_then;  // (nodes, 9) own blocks
     KnownContact *link_now, *link_then;  // blocks between two nodes
     CutNodes* cut;          // nodes that may lose elements, or null
+    KnownDiagonals* known;  // of earlier matrices, or null: factors are never refreshed
 };
 
 constexpr int MAX_CORRECTED = 64;              // nodes
