@@ -293,22 +293,22 @@ class Client:
 
     def states(self, objects: Sequence[str] | None = None) -> States:
         """Subscribes to frames of the named objects (all by default); only the newest of each is kept."""
-        return States(self._session.zenoh, self.name, list(objects or self.scene().objects))
+        return States(self._session.zenoh, self.name, list(objects or self.scene().objects), self._incarnation)
 
     def poses(self, obstacles: Sequence[str] | None = None) -> Poses:
         """Subscribes to poses of obstacles that move (all by default); only the newest of each is kept."""
-        return Poses(self._session.zenoh, self.name, list(obstacles or self.scene().obstacles))
+        return Poses(self._session.zenoh, self.name, list(obstacles or self.scene().obstacles), self._incarnation)
 
     def steps(self) -> Steps:
         """Subscribes to the scalars per step of all objects; a reader that falls behind loses the oldest."""
-        return Steps(self._session.zenoh, self.name)
+        return Steps(self._session.zenoh, self.name, incarnation=self._incarnation)
 
     def reactions(self) -> Steps:
         """Subscribes to what objects exert on obstacles, grabs and each other in each step, sent each millisecond.
 
         The ObjectSteps that it returns hold object, step, time, contacts and reactions alone.
         """
-        return Steps(self._session.zenoh, self.name, "reactions", REACTIONS)
+        return Steps(self._session.zenoh, self.name, "reactions", REACTIONS, self._incarnation)
 
     @property
     def forces(self) -> Forces:
@@ -399,7 +399,11 @@ class Client:
 
     def listen(self, on_batch: Callable[[pb.Steps, float], None] | None) -> Forces:
         """Subscribes to the forces of each step. on_batch: as of Forces; close what is returned after use."""
-        return Forces(self._session.zenoh, self.name, lambda: self._queries.incarnation, on_batch)
+        return Forces(self._session.zenoh, self.name, self._incarnation, on_batch)
+
+    def _incarnation(self) -> int:
+        """Of the server whose messages count."""
+        return self._queries.incarnation
 
     def _command(self, verb: str, interaction: pb.Interaction | None, target: pb.ObstacleTarget | None) -> pb.Command:
         if interaction is not None:

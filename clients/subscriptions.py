@@ -22,11 +22,34 @@ REACTIONS = 1024  # batches of reactions, about 1 s
 
 log = logging.getLogger(__name__)
 
+Incarnation = Callable[[], int | None]
+"""Returns that of the server whose messages count, since anybody may send some in its name; None: all count."""
+
+
+def unknown() -> int | None:
+    """Returns None: whoever sends under the keys of the server counts."""
+    return None
+
+
+class _Refusals:
+    """Tells of the first message that was left out; whoever sends many fills no terminal."""
+
+    def __init__(self) -> None:
+        self._count = 0
+
+    def note(self, what: str, refusal: Refused) -> None:
+        self._count += 1
+        if self._count == 1:
+            log.warning("%s were left out: %s (further ones without a word)", what, refusal)
+
 
 class States:
     """The newest frame of each object, in a ring of one sample per object."""
 
-    def __init__(self, session: zenoh.Session, server: str, objects: list[str]) -> None:
+    def __init__(
+        self, session: zenoh.Session, server: str, objects: list[str], incarnation: Incarnation = unknown
+    ) -> None:  # fmt: skip
+        self._incarnation, self._refusals = incarnation, _Refusals()
         self._rings = {
             name: session.declare_subscriber(key("state", server, object=name), zenoh.handlers.RingChannel(1))
             for name in objects
@@ -41,17 +64,20 @@ class States:
                 continue
             try:
                 state = parse(pb.State, sample.payload, CHANNELS["state"].limit)
-                check_header(state, object=name)
+                check_header(state, object=name, incarnation=self._incarnation())
                 frames.append(frame_of(state))
             except Refused as error:
-                log.warning("a frame was left out: %s", error)
+                self._refusals.note("frames", error)
         return frames
 
 
 class Poses:
     """The newest pose of each obstacle, in a ring of one sample per obstacle."""
 
-    def __init__(self, session: zenoh.Session, server: str, obstacles: list[str]) -> None:
+    def __init__(
+        self, session: zenoh.Session, server: str, obstacles: list[str], incarnation: Incarnation = unknown
+    ) -> None:  # fmt: skip
+        self._incarnation, self._refusals = incarnation, _Refusals()
         self._rings = {
             name: session.declare_subscriber(key("pose", server, object=name), zenoh.handlers.RingChannel(1))
             for name in obstacles
@@ -66,10 +92,10 @@ class Poses:
                 continue
             try:
                 pose = parse(pb.ObstaclePose, sample.payload, CHANNELS["pose"].limit)
-                check_header(pose, object=name)
+                check_header(pose, object=name, incarnation=self._incarnation())
                 found.append(obstacle_frame_of(pose))
             except Refused as error:
-                log.warning("a pose was left out: %s", error)
+                self._refusals.note("poses", error)
         return found
 
 
@@ -102,6 +128,7 @@ class ReactionBatches:
         incarnation: Callable[[], int],
     ) -> None:  # fmt: skip
         self._take, self._gaps, self._incarnation = take, Gaps("reactions"), incarnation
+        self._refusals = _Refusals()
         self._lock = threading.Lock()
         self._subscriber = session.declare_subscriber(key("reactions", server), self._read)
 
@@ -121,7 +148,7 @@ class ReactionBatches:
             check_header(batch, incarnation=self._incarnation())
             check_numbers(batch)
         except Refused as error:
-            log.warning("forces were left out: %s", error)
+            self._refusals.note("forces", error)
             return
         with self._lock:
             self._gaps.note(batch.header)
@@ -131,7 +158,11 @@ class ReactionBatches:
 class Steps:
     """Batches of scalars per step. channel: steps or reactions. batches: that are kept."""
 
-    def __init__(self, session: zenoh.Session, server: str, channel: str = "steps", batches: int = BATCHES) -> None:
+    def __init__(
+        self, session: zenoh.Session, server: str, channel: str = "steps", batches: int = BATCHES,
+        incarnation: Incarnation = unknown,
+    ) -> None:  # fmt: skip
+        self._incarnation, self._refusals = incarnation, _Refusals()
         self._channel, self._gaps = channel, Gaps(channel)
         self._ring = session.declare_subscriber(key(channel, server), zenoh.handlers.RingChannel(batches))
 
@@ -146,9 +177,9 @@ class Steps:
         while (sample := self._ring.try_recv()) is not None:
             try:
                 batch = parse(pb.Steps, sample.payload, CHANNELS[self._channel].limit)
-                check_header(batch)
+                check_header(batch, incarnation=self._incarnation())
                 self._gaps.note(batch.header)
                 steps.extend(batch.steps)
             except Refused as error:
-                log.warning("steps were left out: %s", error)
+                self._refusals.note("steps", error)
         return steps

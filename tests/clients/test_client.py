@@ -161,7 +161,7 @@ def test_garbage_is_left_out(server: FakeServer, client: Client, caplog: pytest.
     def complained() -> bool:
         server.publish_garbage()
         assert states.newest() == [] and steps.new() == []
-        return "a frame was left out" in caplog.text and "steps were left out" in caplog.text
+        return "frames were left out" in caplog.text and "steps were left out" in caplog.text
 
     assert eventually(complained)
 

@@ -58,6 +58,7 @@ class Stage:
         scene.write_text(SCENE)
         self._processes: list[subprocess.Popen[bytes]] = []
         words = [str(scene), "--listen", self.endpoint, "--record", str(self.log), "--quiet", "--device", device]
+        words += [] if host == "127.0.0.1" else ["--insecure"]
         self.server = self.start(tool("sim_server", *words))
 
     def start(self, command: Sequence[str]) -> "subprocess.Popen[bytes]":

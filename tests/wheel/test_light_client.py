@@ -71,9 +71,9 @@ def test_each_extra_lists_packages_and_all_has_those_of_every_machine() -> None:
     """None is this package itself, under a name that no index has; a device and a build from source are not for all."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     extras = project["optional-dependencies"]
-    usual = ("server", "mesh", "view", "web", "export", "metrics")
-    machines = {"server", "mesh", "gpu", "view", "web", "export", "gym", "identify", "slurm", "metrics", "cholmod"}
-    assert set(extras) == machines | {"all", "docs", "test"}
+    usual = ("server", "mesh", "view", "web", "export", "metrics", "tls")
+    others = {"gpu", "gym", "identify", "slurm", "cholmod", "all", "docs", "test"}
+    assert set(extras) == {*usual} | others
     assert not [line for lines in extras.values() for line in lines if line.startswith("warpfactor")]
     assert set(extras["all"]) == {line for name in usual for line in extras[name]}
     assert set(EXTRAS) <= set(extras)

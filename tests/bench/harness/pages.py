@@ -29,6 +29,7 @@ PAGES = (
     "gallery",
     "web",
     "faults",
+    "attacks",
 )
 
 
