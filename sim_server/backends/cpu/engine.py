@@ -447,7 +447,7 @@ class _NativeRefresh:
         for name, array in self._room.items():
             setattr(self._nodes, name, array.ctypes.data)
         self.native = structs.KnownDiagonals(
-            kept=KNOWN_DIAGONALS, score=self._score.ctypes.data, room=c.addressof(self._nodes),
+            kept=KNOWN_DIAGONALS, slow=-1, score=self._score.ctypes.data, room=c.addressof(self._nodes),
             **{name: array.ctypes.data for name, array in self.carried.items()},
         )  # fmt: skip
         body.correction.known = c.addressof(self.native)
