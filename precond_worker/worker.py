@@ -5,6 +5,7 @@ import logging
 import time
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
+from weakref import WeakValueDictionary
 
 import numpy as np
 import zenoh
@@ -40,7 +41,8 @@ class CachedAnalysis(NamedTuple):
 
 
 class Worker:
-    """Does the jobs of one server one by one: the object that waits longest first, of each the newest matrix."""
+    """Does the jobs of one server: the object that waits longest first, of each the newest matrix; together with it
+    those of other objects, where a library factorizes many matrices of one pattern at a time."""
 
     def __init__(
         self, connection: ServerConnection, analyse: Analyse, on_server: Callable[[bool], None] = lambda found: None,
@@ -52,6 +54,7 @@ class Worker:
         self._on_server = on_server
         self._on_factorization = on_factorization
         self._analyses: dict[tuple[str, str], CachedAnalysis] = {}  # by object and name of the method
+        self._patterns: WeakValueDictionary[tuple[bytes, bytes], Factorization] = WeakValueDictionary()
         self._assemblers = Assemblers(connection)
         self._pending: dict[str, Job] = {}
 
@@ -76,11 +79,65 @@ class Worker:
         return len(self._pending)
 
     def work(self) -> bool:
-        """Does one job; returns False if there is none."""
+        """Does one job, or several of one pattern together; returns False if there is none."""
         if not self._pending:
             return False
-        self._do(self._pending.pop(next(iter(self._pending))))
+        jobs = self._next()
+        if len(jobs) == 1 or not self._do_together(jobs):
+            for job in jobs:
+                self._do(job)
         self._done()
+        return True
+
+    def _next(self) -> list[Job]:
+        """Takes the job that waits longest, and others that can be factorized together with it."""
+        first = self._pending.pop(next(iter(self._pending)))
+        shared = self._known_analysis(first)
+        most = getattr(shared, "most", 1) if self._pending else 1
+        jobs = [first]
+        for name, job in list(self._pending.items()):
+            if len(jobs) >= most:
+                break
+            alike = job.message.factor_dtype == first.message.factor_dtype and not (job.positions or first.positions)
+            if alike and self._known_analysis(job) is shared:
+                jobs.append(self._pending.pop(name))
+        return jobs
+
+    def _known_analysis(self, job: Job) -> Factorization | None:
+        """Returns the symbolic phase of a job, if it is done already."""
+        known = self._analyses.get((job.object, job.method.name))
+        same = known is not None and (known.epoch, known.method) == (job.message.header.epoch, job.method)
+        return known.factorization if known is not None and same else None
+
+    def _do_together(self, jobs: Sequence[Job]) -> bool:
+        """Factorizes matrices of one pattern together; False if they must be done one by one."""
+        analysis = self._known_analysis(jobs[0])
+        assert analysis is not None
+        try:
+            for job in jobs:
+                self._analysis(job)  # the number of blocks is right
+            begin = time.perf_counter()
+            values = [job.values(self._connection.slots) for job in jobs]
+            factors = analysis.factorize_many(values, np.dtype(jobs[0].message.factor_dtype))  # type: ignore[attr-defined]
+            seconds = (time.perf_counter() - begin) / len(jobs)
+        except DeviceUnusable as error:
+            for job in jobs:
+                self._answer(job, failure=str(error))
+            raise
+        except (Refused, ValueError, MemoryError):
+            return False
+        if factors is None:
+            return False
+        for job, factor in zip(jobs, factors, strict=True):
+            self._count(job)
+            self._on_factorization(seconds)
+            try:
+                self._send_pattern(job, analysis.pattern)
+                self._answer(job, analysis.pattern, factor, seconds)
+            except Refused as refusal:  # its slot was lent to somebody else
+                self._counters.refuse(refusal)
+            except zenoh.ZError as error:
+                self._counters.trouble("unsent", f"a factor was not sent: {error}")
         return True
 
     def _done(self) -> None:
@@ -134,11 +191,14 @@ class Worker:
                 return
         self._pending[job.object] = job
 
-    def _do(self, job: Job) -> None:
+    def _count(self, job: Job) -> None:
         self._counters.add("jobs")
         self._counters.add("bulk_shared" if job.shared else "bulk_copied")
         if job.message.HasField("matrix_slot") and not job.shared:
             self._counters.warn("copied", "a matrix came as a copy although shared memory was tried and found to work")
+
+    def _do(self, job: Job) -> None:
+        self._count(job)
         try:
             self._factorize(job)
         except Refused as refusal:
@@ -192,7 +252,7 @@ class Worker:
             topology = self._connection.topology(object, epoch)
             row_start = array(topology.row_start, np.int32, (topology.nodes + 1,), "Topology.row_start")
             columns = array(topology.columns, np.int32, (-1,), "Topology.columns")
-            analysis = self._analyse(row_start, columns, job.method)
+            analysis = self._shared(row_start, columns, job.method)
             known = CachedAnalysis(epoch, job.method, len(columns), analysis)
             self._analyses[object, job.method.name] = known
             if job.method.name == "cholesky":  # by one of several libraries
@@ -200,6 +260,16 @@ class Worker:
         if known.blocks != blocks:
             raise Refused(f"Matrix.blocks is {blocks}; allowed: {known.blocks}, as in the topology", "shape")
         return known.factorization
+
+    def _shared(self, row_start: Int32, columns: Int32, method: Method) -> Factorization:
+        """Returns the symbolic phase of a pattern; objects of one pattern share that of complete factors."""
+        if method.name != "cholesky":
+            return self._analyse(row_start, columns, method)
+        key = row_start.tobytes(), columns.tobytes()
+        known = self._patterns.get(key)
+        if known is None:
+            known = self._patterns[key] = self._analyse(row_start, columns, method)
+        return known
 
     def _answer(
         self,

@@ -11,6 +11,8 @@ ROOT = "warpfactor"
 SERVER_NAME = "sim"
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"  # loopback: a server listens on other interfaces only when asked
 
+MOST_JOBS = 64  # in flight at one worker, of small objects
+
 KIB, MIB, GIB = 1 << 10, 1 << 20, 1 << 30
 
 

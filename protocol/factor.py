@@ -66,6 +66,13 @@ class FactorPattern:
         return int((width * height - width * (width - 1) // 2).sum())
 
     @cached_property
+    def value_start(self) -> Int64:
+        """Index of the first value of each supernode among the values, (s,)."""
+        width, height = np.diff(self.super_start).astype(np.int64), np.diff(self.row_start)
+        sizes = width * height - width * (width - 1) // 2
+        return np.concatenate([[0], np.cumsum(sizes)[:-1]]).astype(np.int64)
+
+    @cached_property
     def diagonal(self) -> Int64:
         """Index of the diagonal value of each column among the values, (n,)."""
         width = np.diff(self.super_start).astype(np.int64)

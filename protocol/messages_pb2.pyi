@@ -236,7 +236,7 @@ class Factor(_message.Message):
     def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., step: _Optional[int] = ..., warp: _Optional[bool] = ..., pattern: _Optional[int] = ..., dtype: _Optional[str] = ..., nonzeros: _Optional[int] = ..., checksum: _Optional[int] = ..., slot: _Optional[_Union[Slot, _Mapping]] = ..., worker: _Optional[str] = ..., seconds: _Optional[float] = ..., failure: _Optional[str] = ..., job: _Optional[int] = ..., matrix_shared: _Optional[bool] = ..., remedy: _Optional[str] = ...) -> None: ...
 
 class WorkerInfo(_message.Message):
-    __slots__ = ("header", "worker", "pid", "host", "library", "threads", "shared_memory", "jobs", "failures", "superseded", "refused", "bulk_shared", "bulk_copied", "builds", "idle", "share", "leaving")
+    __slots__ = ("header", "worker", "pid", "host", "library", "threads", "shared_memory", "jobs", "failures", "superseded", "refused", "bulk_shared", "bulk_copied", "builds", "idle", "share", "leaving", "most_jobs")
     HEADER_FIELD_NUMBER: _ClassVar[int]
     WORKER_FIELD_NUMBER: _ClassVar[int]
     PID_FIELD_NUMBER: _ClassVar[int]
@@ -254,6 +254,7 @@ class WorkerInfo(_message.Message):
     IDLE_FIELD_NUMBER: _ClassVar[int]
     SHARE_FIELD_NUMBER: _ClassVar[int]
     LEAVING_FIELD_NUMBER: _ClassVar[int]
+    MOST_JOBS_FIELD_NUMBER: _ClassVar[int]
     header: Header
     worker: str
     pid: int
@@ -271,7 +272,8 @@ class WorkerInfo(_message.Message):
     idle: bool
     share: float
     leaving: bool
-    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., worker: _Optional[str] = ..., pid: _Optional[int] = ..., host: _Optional[str] = ..., library: _Optional[str] = ..., threads: _Optional[int] = ..., shared_memory: _Optional[bool] = ..., jobs: _Optional[int] = ..., failures: _Optional[int] = ..., superseded: _Optional[int] = ..., refused: _Optional[int] = ..., bulk_shared: _Optional[int] = ..., bulk_copied: _Optional[int] = ..., builds: _Optional[bool] = ..., idle: _Optional[bool] = ..., share: _Optional[float] = ..., leaving: _Optional[bool] = ...) -> None: ...
+    most_jobs: int
+    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., worker: _Optional[str] = ..., pid: _Optional[int] = ..., host: _Optional[str] = ..., library: _Optional[str] = ..., threads: _Optional[int] = ..., shared_memory: _Optional[bool] = ..., jobs: _Optional[int] = ..., failures: _Optional[int] = ..., superseded: _Optional[int] = ..., refused: _Optional[int] = ..., bulk_shared: _Optional[int] = ..., bulk_copied: _Optional[int] = ..., builds: _Optional[bool] = ..., idle: _Optional[bool] = ..., share: _Optional[float] = ..., leaving: _Optional[bool] = ..., most_jobs: _Optional[int] = ...) -> None: ...
 
 class Need(_message.Message):
     __slots__ = ("header", "lost", "workers")

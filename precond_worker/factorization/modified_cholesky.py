@@ -7,6 +7,8 @@
    growth of LDL^T is out of bounds.
 """
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
@@ -57,6 +59,22 @@ class ModifiedCholesky:
             if found is None:
                 raise first
             return found
+
+    @property
+    def most(self) -> int:
+        """Number of matrices that are factorized together."""
+        return self._analysis.most
+
+    def factorize_many(
+        self, values: Sequence[ArrayLike], dtype: DTypeLike = np.float32
+    ) -> Sequence[NDArray[np.floating]] | None:  # fmt: skip
+        """Returns the values of L of up to `most` matrices; None if one of them may need a remedy, or is malformed."""
+        self.remedy = ""
+        made = self._analysis.factorize_many(values, dtype)
+        if made is None:
+            return None
+        pairs = zip(made, values, strict=True)
+        return made if all(self._sound(each, np.asarray(matrix)) for each, matrix in pairs) else None
 
     def _sound(self, made: NDArray[np.floating], matrix: Float64) -> bool:
         """True if every pivot is more than rounding error."""

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: MIT
 """A plan on the device: its tables and memory, and all launches of a factorization as one CUDA graph."""
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -28,11 +29,14 @@ class Outcome(NamedTuple):
 class Executor:
     """Factorizes matrices of one plan in memory of its own.
 
-    precision, stored: "float32" or "float64", of the fronts and of L. Raises MemoryError, with the
-    number of bytes, if the device has too little memory.
+    precision, stored: "float32" or "float64", of the fronts and of L
+    copies: number of matrices of one pattern that the plan is of (copies.py)
+
+    Raises MemoryError, with the number of bytes, if the device has too little memory.
     """
 
-    def __init__(self, plan: MultifrontalPlan, precision: str, stored: str):
+    def __init__(self, plan: MultifrontalPlan, precision: str, stored: str, copies: int = 1):
+        self._copies, self._full = copies, copies == 1
         self._cp, self._plan, self.precision = cupy(), plan, precision
         self._kernels = kernels(precision, stored)
         self._stored = np.dtype(stored)
@@ -115,22 +119,29 @@ class Executor:
             "store": (fronts, start, count, here, self._values, status),
         }[launch.kernel]
 
-    def run(self, matrix: Float64) -> tuple[NDArray[Any], Outcome]:
-        """Returns the values of L, (nonzeros,), of block values (blocks, 3, 3), in an array of their own.
+    def run(self, matrices: Sequence[Float64]) -> tuple[NDArray[Any], Outcome]:
+        """Returns the values of L of each, (len(matrices), nonzeros), of block values (blocks, 3, 3), in an array of
+        their own. Columns of L in the outcome are counted through all of them.
 
+        matrices: one up to as many as the plan is of
         Raises DeviceUnusable if the device fails; this process cannot use it any more.
         """
-        np.copyto(self._sent, matrix.reshape(-1))
-        values = self._pinned(self._plan.nonzeros, self._stored)
+        sent = self._sent.reshape(self._copies, -1)
+        count = len(matrices) if self._full else self._copies
+        for k in range(count):  # at first, and after a failure, also what takes the place of those that are missing
+            np.copyto(sent[k], matrices[min(k, len(matrices) - 1)].reshape(-1))
+        values = self._pinned(len(matrices) * self._plan.nonzeros // self._copies, self._stored)
         try:
-            self._send_launch_receive(values)
+            self._send_launch_receive(sent[:count], values)
         except self._cp.cuda.runtime.CUDARuntimeError as error:
             raise DeviceUnusable(f"the GPU failed: {error}") from error
         pivot, range_, infinite = (-1 if c == NONE else int(c) for c in self._outcome)
-        return values, Outcome(pivot, range_, bool(infinite))
+        outcome = Outcome(pivot, range_, bool(infinite))
+        self._full = self._copies == 1 or outcome == Outcome(-1, -1, False)
+        return values.reshape(len(matrices), -1), outcome
 
-    def _send_launch_receive(self, values: NDArray[Any]) -> None:
-        self._copy(self._blocks.data.ptr, self._sent.ctypes.data, self._sent.nbytes)
+    def _send_launch_receive(self, sent: NDArray[np.float64], values: NDArray[Any]) -> None:
+        self._copy(self._blocks.data.ptr, sent.ctypes.data, sent.nbytes)
         self._graph.launch(self.stream)
         self._copy(self._outcome.ctypes.data, self._status.data.ptr, self._outcome.nbytes)
         self._copy(values.ctypes.data, self._values.data.ptr, values.nbytes)

@@ -1,12 +1,15 @@
 # SPDX-License-Identifier: MIT
 """Complete factorizations on the GPU."""
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
 from precond_worker.arrays import Float64, Int32
 from precond_worker.errors import NotPositiveDefinite, OutOfRange
 from precond_worker.gpu.assembly_tree import assembly_tree
+from precond_worker.gpu.copies import copies
 from precond_worker.gpu.device import best_precision, name, try_out
 from precond_worker.gpu.executor import Executor
 from precond_worker.gpu.plan import make_plan
@@ -14,11 +17,16 @@ from precond_worker.symbolic.elimination import eliminate
 from precond_worker.symbolic.ordering import order_nodes
 from protocol.factor import FactorPattern
 
+MOST = 64  # matrices that are factorized together
+COPIES = (1, 4, 16, MOST)  # of a pattern in the plans that are made
+BYTES = 64 << 20  # of the matrices and factors of a launch, about
+
 
 class GpuFactorization:
     """Factors of one block pattern on the current CUDA device.
 
     precision: auto, float32 or float64. L in float64 is always computed in float64.
+    most: matrices that `factorize_many` takes at a time
     """
 
     def __init__(self, row_start: Int32, columns: Int32, precision: str = "auto"):
@@ -28,13 +36,17 @@ class GpuFactorization:
         tree = assembly_tree(eliminate(row_start, columns, order_nodes(row_start, columns)))
         self.pattern = FactorPattern.build(**tree.pattern_arrays())
         self.plan = make_plan(tree, row_start, columns)
-        self._executors: dict[str, Executor] = {}
+        self._tree, self._row_start, self._columns = tree, row_start, columns
+        self._executors: dict[tuple[str, int], Executor] = {}
+        bytes_of_one = 8 * self.pattern.nonzeros + 72 * len(columns)
+        self.most = max(1, min(MOST, BYTES // bytes_of_one))
 
     def factorize(
         self, matrix: Float64, dtype: np.dtype[np.floating], out: NDArray[np.floating] | None
     ) -> NDArray[np.floating]:
         """Returns the values of L (factorize.Analysis.factorize). Raises MemoryError for lack of device memory."""
-        values, outcome = self.executor(dtype.name).run(matrix)
+        found, outcome = self.executor(dtype.name).run([matrix])
+        values: NDArray[np.floating] = found[0]
         if outcome.infinite:
             raise ValueError("matrix: values hold NaN or infinity, allowed: finite numbers")
         if outcome.pivot >= 0:
@@ -46,18 +58,36 @@ class GpuFactorization:
         np.copyto(out, values)
         return out
 
+    def factorize_many(
+        self, matrices: Sequence[Float64], dtype: np.dtype[np.floating]
+    ) -> Sequence[NDArray[np.floating]] | None:  # fmt: skip
+        """Returns the values of L of up to `most` matrices, made in the launches of one; None if one of them has none,
+        or the device has too little memory."""
+        try:
+            executor = self.executor(dtype.name, next(c for c in COPIES if c >= len(matrices)))
+        except MemoryError:
+            self.most = 1
+            return None
+        values, outcome = executor.run(matrices)
+        failed = outcome.infinite or outcome.pivot >= 0 or outcome.range >= 0
+        return None if failed else list(values)
+
     def modified_ldl(
         self, matrix: Float64, dtype: np.dtype[np.floating], growth: float
     ) -> tuple[NDArray[np.floating], int]:
         """Raises NotPositiveDefinite: the fronts have no D."""
         raise NotPositiveDefinite("no LDL^T on a GPU")
 
-    def executor(self, stored: str) -> Executor:
-        """Returns the executor for values of L of this type, made at the first call."""
-        if stored not in self._executors:
+    def executor(self, stored: str, count: int = 1) -> Executor:
+        """Returns the executor for values of L of this type, of `count` matrices at a time; made at the first call."""
+        if (stored, count) not in self._executors:
             precision = "float64" if stored == "float64" else self._precision
-            self._executors[stored] = Executor(self.plan, precision, stored)
-        return self._executors[stored]
+            plan = self.plan
+            if count > 1:
+                many = copies(self._tree, self._row_start, self._columns, count)
+                plan = make_plan(many.tree, many.row_start, many.columns)
+            self._executors[stored, count] = Executor(plan, precision, stored, count)
+        return self._executors[stored, count]
 
 
 def title(precision: str) -> str:

@@ -17,7 +17,7 @@ from precond_worker.network.presence import Presence, ServerGone, ServersThere
 from precond_worker.network.receive_queue import ReceiveQueue
 from precond_worker.network.retry import Retry
 from precond_worker.remote_assembly import can_assemble
-from protocol.channels import CHANNELS, PROTOCOL, check_name, key
+from protocol.channels import CHANNELS, MOST_JOBS, PROTOCOL, check_name, key
 from protocol.counters import Counters
 from protocol.factor import FactorPattern
 from protocol.messages_pb2 import Factor, Header, Scene, Topology, WorkerInfo
@@ -148,6 +148,7 @@ class ServerConnection:
                 idle=self.received.idle,
                 share=self.share,
                 leaving=self.leaving is not None,
+                most_jobs=MOST_JOBS,
             )
             self._session.zenoh.put(key("worker", self.server, worker=self.name), info.SerializeToString())
 

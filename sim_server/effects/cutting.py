@@ -114,11 +114,6 @@ class Cutting(Effect):
                 f"object {self.bodies[0].name!r}, effect cutting: pieces that come apart need inertia, which the "
                 "scheme quasi_static leaves out"
             )
-        if world.backend.name == "gpu" and world.forces_alone and not world.explicit:
-            raise InputError(
-                f"object {self.bodies[0].name!r}, effect cutting: the scheme ros2 cannot go on with it on a GPU; "
-                "allowed there: others, as backward_euler"
-            )
         n, masses = world.nodes, world.mass.copy()
         world.uncut_mass = masses
 
@@ -200,7 +195,9 @@ class Cutting(Effect):
         for body in self.bodies:
             listed = [e for e in effects.values() if e.name in body.effects and e.name != "fixed"]
             if wrong := [e.name for e in listed if not e.cuttable(body)]:
-                raise self._refusal(body, f"elements cannot be removed with the effect {wrong[0]}")
+                others = [b.name for b in w.bodies if b.elements != "linear" and wrong[0] in b.effects]
+                why = f', which object {others[0]!r} has, too: set its elements = "linear"' if others else ""
+                raise self._refusal(body, f"elements cannot be removed with the effect {wrong[0]}{why}")
             if body.effects["cutting"].spare:
                 self._check_splittable(body, [e for e in listed if e is not self], effects)
             tied = {a.object for a in w.attachments} | {a.to for a in w.attachments}

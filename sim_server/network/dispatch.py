@@ -5,13 +5,16 @@ import logging
 import threading
 import time
 from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
+from functools import partial
 
 import numpy as np
 import zenoh
 
-from protocol.channels import CHANNELS, key, name_in
+from protocol.channels import CHANNELS, MOST_JOBS, key, name_in
 from protocol.counters import Counters
 from protocol.factor import Factor, FactorPattern
+from protocol.messages_pb2 import Factor as FactorMessage
 from protocol.messages_pb2 import Topology, WorkerInfo
 from protocol.refused import Refused
 from protocol.shared_memory.pool import Slot, SlotPool
@@ -31,6 +34,11 @@ log = logging.getLogger(__name__)
 TOKEN_QUERY_INTERVAL = 1.0  # s between queries for tokens of workers that send heartbeats without one
 FAST_SEND = 0.05  # s in which a fast link takes a job as bytes; zenoh drops what is not taken within 0.25 s
 MAX_NEW_PATTERNS = 256  # that wait to be prepared for; older ones are prepared for when their factors come
+SMALL_BLOCKS = 20_000  # of the largest matrix, if several jobs may wait at a worker
+QUEUE_SECONDS = 0.02  # s of factorizations that wait at a worker at most
+LOOK_PERIOD = 1e-3  # s between looks at which leases are over
+MAX_SENT = 4096  # times of jobs that are remembered
+LARGE = 4 << 20  # bytes of a factor whose copy and checks take more than a few milliseconds
 SLOT_MARGIN = 8  # the slot for an incomplete factor is larger than the largest factor so far by a SLOT_MARGIN-th
 
 
@@ -64,13 +72,17 @@ class Dispatch(FactorSource):
         self._lock = threading.RLock()  # a status lists the workers while the loop thread takes in a factor
         self._last_worker: dict[str, str] = {}  # by object: the worker that knows its pattern already
         self._free_since: dict[str, float] = {}  # by worker, time of its last answer
-        self._sent: dict[str, tuple[int, float]] = {}  # by worker: its last job that the network took, and when
+        self._sent: dict[int, float] = {}  # when the network took a job, by its number
+        self._answered_at: dict[str, float] = {}  # likewise, of the answers with a factor
         self._fast_links: set[str] = set()  # workers without shared memory whose link takes a job at once
+        self._thread = ThreadPoolExecutor(1, "large factors")
+        self._decoding: list[tuple[FactorMessage, InFlightJob, Future[Factor]]] = []
         self._factors: list[Factor] = []
         self._failures: list[tuple[str, str]] = []
         self._patterns: list[tuple[str, FactorPattern]] = []
         self._inbox = Inbox(session, server)
         self._token_query_due = 0.0
+        self._looked_at = -LOOK_PERIOD  # at which leases were looked through
         self._on_message: dict[str, Callable[[zenoh.Sample], None]] = {
             "worker": self._on_heartbeat,
             "pattern": self._on_pattern,
@@ -107,10 +119,10 @@ class Dispatch(FactorSource):
             return self._registry.unclaimed_tokens
 
     def ready(self) -> int:
-        """Number of idle workers."""
+        """Number of jobs that workers can take now: one of each idle worker, more where all objects are small."""
         with self._lock:
             self._receive()
-            return len(self._idle())
+            return sum(self._room(name) for name in self._open())
 
     def poll(self) -> list[Factor]:
         """Returns the factors that arrived and passed all checks since the last call."""
@@ -145,8 +157,8 @@ class Dispatch(FactorSource):
         """Number of busy workers that would finish one more job before the fastest idle one could."""
         with self._lock:
             now = self._clock()
-            idle = [(name, now - self._free_since.get(name, 0.0)) for name in self._idle()]
-            busy = [(job.worker, job.object, now - job.sent_at) for job in self._leases.by_worker.values()]
+            idle = [(name, now - self._free_since.get(name, 0.0)) for name in self._open()]
+            busy = [(j.worker, j.object, now - j.sent_at) for j in self._leases.jobs if not self._room(j.worker)]
             return self._timing.faster_busy_workers(idle, busy)
 
     def reassigned(self) -> list[str]:
@@ -162,7 +174,7 @@ class Dispatch(FactorSource):
             failing = self._reliability.failing_objects
             if not failing:
                 return set()
-            idle, available = self._idle(), self._available()
+            idle, available = self._open(), self._available()
             return {object for object in failing if idle and not self._candidates(idle, available, object)}
 
     def consecutive_failures(self) -> dict[str, int]:
@@ -185,7 +197,7 @@ class Dispatch(FactorSource):
     # ---- jobs to workers -------------------------------------------------------------------------------------
 
     def submit(self, job: Job) -> bool:
-        """Sends a job to an idle worker; False if there is none or the object has a job in flight."""
+        """Sends a job to a worker with room; False if there is none or the object has a job in flight."""
         with self._lock:
             return self._submit(job)
 
@@ -197,7 +209,7 @@ class Dispatch(FactorSource):
         if job.values.shape != shape or job.values.dtype != np.float64:
             raise ValueError(f"job for {job.object}: values {job.values.shape}, allowed: float64 {shape}")
         self._receive()
-        idle = [name for name in self._idle() if not job.positions or self._assembles(name)]
+        idle = [name for name in self._open() if not job.positions or self._assembles(name)]
         idle = self._candidates(idle, self._available(), job.object)
         if job.object in self._leases.by_object or not idle:
             return False
@@ -236,10 +248,24 @@ class Dispatch(FactorSource):
     def _available(self) -> list[str]:
         return self._registry.available(self._clock(), self._leases.deadlines())
 
-    def _idle(self) -> list[str]:
+    def _open(self) -> list[str]:
+        """Available workers with room for a job."""
         available, now = self._available(), self._clock()
-        idle = [name for name in available if name not in self._leases.by_worker]
-        return [name for name in idle if self._reliability.may_get_job(name, available, now)]
+        free = [name for name in available if self._room(name) > 0]
+        return [name for name in free if self._reliability.may_get_job(name, available, now)]
+
+    def _room(self, worker: str) -> int:
+        """Number of jobs that a worker can take beside those it has.
+
+        Several wait at a worker only where all objects are small and arrays are in shared memory, as many as it does
+        within QUEUE_SECONDS: it then need not wait for the network after each, and may factorize them together.
+        """
+        info, seconds = self._registry.info(worker), self._timing.mean_factorization(worker)
+        most = 1
+        small = self._decoder.most_blocks <= SMALL_BLOCKS and self._pool is not None
+        if info is not None and info.shared_memory and seconds is not None and small:
+            most = max(1, min(info.most_jobs, MOST_JOBS, int(QUEUE_SECONDS / max(seconds, 1e-6))))
+        return max(0, most - self._leases.count(worker))
 
     def _candidates(self, idle: list[str], available: list[str], object: str) -> list[str]:
         """Idle workers that are not suspended for the object; all idle ones if all available workers are."""
@@ -249,19 +275,22 @@ class Dispatch(FactorSource):
 
     def _has_candidates(self, job: InFlightJob) -> bool:
         """True if another worker could take the object of a job in flight."""
-        return bool(self._candidates(self._idle(), self._available(), job.object))
+        others = [name for name in self._open() if name != job.worker]
+        return bool(self._candidates(others, self._available(), job.object)) if others else False
 
     def _assembles(self, worker: str) -> bool:
         info = self._registry.info(worker)
         return info is not None and info.builds
 
     def _choose(self, idle: list[str], object: str) -> str:
-        """Chooses the worker with the fewest expired jobs; then the fastest, the last of the object, the least used."""
+        """Chooses the worker with the fewest expired jobs; then the one that would be done first, the one with the
+        fewest jobs in flight, the last of the object, the least used."""
 
-        def rank(name: str) -> tuple[int, float, bool, int]:
-            info = self._registry.info(name)
+        def rank(name: str) -> tuple[int, float, int, bool, int]:
+            info, waiting = self._registry.info(name), self._leases.count(name)
             expired, expected = self._leases.expired_count(name), self._timing.expected(name, object)
-            return expired, expected, self._last_worker.get(object) != name, info.jobs if info else 0
+            other = self._last_worker.get(object) != name
+            return expired, (1 + waiting) * expected, waiting, other, info.jobs if info else 0
 
         return min(idle, key=rank)
 
@@ -304,7 +333,7 @@ class Dispatch(FactorSource):
         )
         if not drop and time.perf_counter() - begin < FAST_SEND:
             self._fast_links.add(job.worker)
-        self._sent[job.worker] = job.number, self._clock()
+        self._sent[job.number] = self._clock()
 
     # ---- messages from workers -------------------------------------------------------------------------------
 
@@ -315,8 +344,16 @@ class Dispatch(FactorSource):
                 self._on_message[channel](sample)
             except Refused as refusal:
                 self._counters.refuse(refusal)
+        self._take_decoded()
         self._query_tokens()
-        for job in self._leases.expire(self._clock()):
+        now = self._clock()
+        if now < self._looked_at + LOOK_PERIOD:
+            return  # many jobs are submitted one after another
+        self._looked_at = now
+        if len(self._sent) > MAX_SENT:
+            flying = {job.number for job in self._leases.jobs}
+            self._sent = {number: when for number, when in self._sent.items() if number in flying}
+        for job in self._leases.expire(now):
             self._counters.add("leases_over")
             self._on_expired(job, "was not answered within its lease")
         for job in self._leases.expire_undelivered(self._sent_at, self._registry.idle_period):
@@ -324,8 +361,7 @@ class Dispatch(FactorSource):
             self._on_expired(job, f"was lost: worker {job.worker} says that it has no job")
 
     def _sent_at(self, job: InFlightJob) -> float:
-        number, when = self._sent.get(job.worker, (0, 0.0))
-        return when if number == job.number else float("inf")
+        return float("inf") if self._is_decoded(job) else self._sent.get(job.number, float("inf"))
 
     def _on_expired(self, job: InFlightJob, why: str) -> None:
         self._fast_links.discard(job.worker)  # zenoh may have dropped the job
@@ -358,13 +394,13 @@ class Dispatch(FactorSource):
                 self._counters.warn("worker_copies", f"worker {name} has no shared memory with us, arrays are copied")
 
     def _remove_worker(self, name: str) -> None:
-        job = self._leases.remove_worker(name)
+        lost = self._leases.remove_worker(name)
         self._timing.forget_worker(name)
         self._reliability.forget_worker(name)
         self._fast_links.discard(name)
-        self._sent.pop(name, None)
         self._free_since.pop(name, None)
-        if job is not None:
+        self._answered_at.pop(name, None)
+        for job in lost:
             self._counters.add("jobs_lost")
             self._fail(job, f"was lost with worker {name}")
 
@@ -375,20 +411,50 @@ class Dispatch(FactorSource):
     def _on_factor(self, sample: zenoh.Sample) -> None:
         message = self._decoder.parse_factor(sample.key_expr, sample.attachment)
         job = self._leases.match_answer(message.job, message.worker, message.header.epoch)
-        now, seconds = self._clock(), None
+        now = self._clock()
         self._registry.mark_seen(job.worker, now)
         self._free_since[job.worker] = now
         self._reliability.on_answer(job.worker)
         if self._leases.is_reassigned(job):
             return self._leases.finish(job, None if message.failure else message.seconds)
+        decode = partial(self._decoder.decode, message, sample.payload, job)
+        if not message.failure and 4 * message.nonzeros > LARGE:  # its bytes are copied and checked beside the caller
+            if self._is_decoded(job):
+                raise Refused(f"Factor.job is {job.number}, already answered", "duplicate")
+            self._decoding.append((message, job, self._thread.submit(decode)))
+            return
+        self._take_factor(message, job, decode)
+
+    def _is_decoded(self, job: InFlightJob) -> bool:
+        """True while the answer to a job is decoded beside the caller."""
+        return any(other.number == job.number for _, other, _ in self._decoding)
+
+    def _take_decoded(self) -> None:
+        """Takes the large factors that were decoded beside the caller, unless their jobs are over."""
+        done = [each for each in self._decoding if each[2].done()]
+        for each in done:
+            self._decoding.remove(each)
+            message, job, factor = each
+            try:
+                current = self._leases.match_answer(job.number, job.worker, job.epoch)
+                if self._leases.is_reassigned(current):
+                    self._leases.finish(current, message.seconds)
+                else:
+                    self._take_factor(message, current, factor.result)
+            except Refused as refusal:
+                self._counters.refuse(refusal)
+
+    def _take_factor(self, message: FactorMessage, job: InFlightJob, decode: Callable[[], Factor]) -> None:
+        """Takes the answer to a job: the factor that `decode` returns, or a failure."""
+        now, seconds = self._clock(), None
         try:
             if message.failure:
                 self._counters.add("failures")
                 self._reliability.on_failure(job.worker, job.object, now)
                 return self._fail(job, f"failed: {message.failure}")
-            self._factors.append(self._decoder.decode(message, sample.payload, job))
+            self._factors.append(decode())
             seconds = message.seconds
-            self._timing.record(job.worker, job.object, now - job.sent_at, seconds)
+            self._timing.record(job.worker, job.object, self._duration(job, now), seconds)
         except Refused as refusal:
             self._reliability.on_failure(job.worker, job.object, now)
             self._fail(job, f"was refused: {refusal}")
@@ -401,6 +467,11 @@ class Dispatch(FactorSource):
         fits = 0 < self._factors[-1].values.nbytes <= capacity  # an incomplete factor may be the largest so far
         self._count_bulk("matrix", job, message.matrix_shared, bool(job.slots))
         self._count_bulk("factor", job, message.HasField("slot"), fits)
+
+    def _duration(self, job: InFlightJob, now: float) -> float:
+        """Time [s] from matrix to factor, without that for which the job waited behind others of its worker."""
+        last, self._answered_at[job.worker] = self._answered_at.get(job.worker, 0.0), now
+        return now - max(job.sent_at, last)
 
     def _count_bulk(self, what: str, job: InFlightJob, shared: bool, allocated: bool) -> None:
         self._counters.add("bulk_shared" if shared else "bulk_copied")

@@ -41,11 +41,18 @@ class FactorDecoder:
     def __init__(self, incarnation: int):
         self._incarnation = incarnation
         self.objects: dict[str, AnnouncedObject] = {}
+        self._most_blocks = 0
+
+    @property
+    def most_blocks(self) -> int:
+        """Blocks of the largest matrix."""
+        return self._most_blocks
 
     def announce(self, topology: Topology) -> None:
         """Begins a new epoch of an object; patterns of the last one are dropped."""
         header = topology.header
         self.objects[header.object] = AnnouncedObject(header.epoch, 3 * topology.nodes, len(topology.columns) // 4)
+        self._most_blocks = max(known.blocks for known in self.objects.values())
 
     def add_pattern(self, key: object, data: Sized) -> tuple[str, FactorPattern] | None:
         """Keeps the pattern that a worker sends before its first factor with it; returns it with its object if it is

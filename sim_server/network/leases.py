@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Jobs in flight: at most one per object and per worker, each with a lease and the slots allocated for it.
+"""Jobs in flight: at most one per object, each with a lease and the slots allocated for it.
 
 Pure bookkeeping, without network or clock.
 """
@@ -70,7 +70,7 @@ class Leases:
     def __init__(self, allocator: SlotAllocator | None):
         self._allocator = allocator
         self.by_object: dict[str, InFlightJob] = {}
-        self.by_worker: dict[str, InFlightJob] = {}
+        self.by_worker: dict[str, dict[int, InFlightJob]] = {}  # by number; absent: none
         self._expired: dict[str, list[InFlightJob]] = {}  # by worker
         self._seconds: dict[str, dict[str, float]] = {}  # duration of the last factorization, by object and worker
         self._answered: dict[tuple[str, str], set[tuple[str, bool]]] = {}  # methods, and whether it assembled, likewise
@@ -105,12 +105,29 @@ class Leases:
     def start(self, job: InFlightJob) -> None:
         """Adds a job that is being sent."""
         self.by_object[job.object] = job
-        self.by_worker[job.worker] = job
+        self.by_worker.setdefault(job.worker, {})[job.number] = job
 
     def cancel(self, job: InFlightJob) -> None:
         """Removes a job that was never sent."""
-        del self.by_object[job.object], self.by_worker[job.worker]
+        del self.by_object[job.object]
+        self._drop(job)
         self._free_slots(job)
+
+    def _drop(self, job: InFlightJob) -> None:
+        """Removes a job from those of its worker."""
+        jobs = self.by_worker.get(job.worker, {})
+        jobs.pop(job.number, None)
+        if not jobs:
+            self.by_worker.pop(job.worker, None)
+
+    def count(self, worker: str) -> int:
+        """Number of jobs in flight at a worker."""
+        return len(self.by_worker.get(worker, ()))
+
+    @property
+    def jobs(self) -> list[InFlightJob]:
+        """All jobs in flight."""
+        return [job for jobs in self.by_worker.values() for job in jobs.values()]
 
     def reassign(self, now: float, can_move: Callable[[InFlightJob], bool]) -> list[InFlightJob]:
         """Frees the objects of jobs whose exclusive period is over, if another worker could take them (`can_move`).
@@ -133,8 +150,8 @@ class Leases:
 
     def match_answer(self, number: int, worker: str, epoch: int) -> InFlightJob:
         """Finds the job in flight that an answer belongs to; raises Refused if there is none."""
-        job = self.by_worker.get(worker)
-        if job is not None and job.number == number:
+        job = self.by_worker.get(worker, {}).get(number)
+        if job is not None:
             if epoch != job.epoch:
                 raise Refused(f"Factor.header.epoch is {epoch}; allowed: {job.epoch}, as in the matrix", "epoch")
             if self.by_object.get(job.object) is job or self.is_reassigned(job):
@@ -155,8 +172,7 @@ class Leases:
         """
         if self.by_object.get(job.object) is job:
             del self.by_object[job.object]
-        if self.by_worker.get(job.worker) is job:
-            del self.by_worker[job.worker]
+        self._drop(job)
         self._reassigned.discard(job.number)
         self._free_slots(job)
         self._free_expired(job.worker, job.number)
@@ -167,7 +183,7 @@ class Leases:
 
     def expire(self, now: float) -> list[InFlightJob]:
         """Ends the leases that are over: objects and workers are free again, the slots are not. Returns the jobs."""
-        return self._expire([job for job in self.by_worker.values() if now > job.deadline])
+        return self._expire([job for job in self.jobs if now > job.deadline])
 
     def expire_undelivered(
         self, sent_at: Callable[[InFlightJob], float], idle: Callable[[str], tuple[float, float] | None]
@@ -182,7 +198,7 @@ class Leases:
             period = idle(job.worker)
             return period is not None and period[1] - max(period[0], sent_at(job)) > self.delivery_time(job)
 
-        return self._expire([job for job in self.by_worker.values() if lost(job)])
+        return self._expire([job for job in self.jobs if lost(job)])
 
     def delivery_time(self, job: InFlightJob) -> float:
         """Time [s] that a job may need to reach its worker; doubled after each job that expired."""
@@ -191,7 +207,7 @@ class Leases:
 
     def _expire(self, over: list[InFlightJob]) -> list[InFlightJob]:
         for job in over:
-            del self.by_worker[job.worker]
+            self._drop(job)
             self._reassigned.discard(job.number)
             pair = job.object, job.worker
             self._doublings[pair] = min(MAX_DOUBLINGS, self._doublings.get(pair, 0) + 1)
@@ -209,8 +225,8 @@ class Leases:
             for pair in [pair for pair in known if pair[0] == object]:
                 del known[pair]
 
-    def remove_worker(self, worker: str) -> InFlightJob | None:
-        """Frees all slots of a worker that left; returns its job if that is of the present epoch of its object."""
+    def remove_worker(self, worker: str) -> list[InFlightJob]:
+        """Frees all slots of a worker that left; returns its jobs that are of the present epoch of their objects."""
         for old in self._expired.pop(worker, []):
             self._free_slots(old)
         for seconds in self._seconds.values():
@@ -218,22 +234,22 @@ class Leases:
         for known in (self._doublings, self._answered):
             for pair in [pair for pair in known if pair[1] == worker]:
                 del known[pair]
-        job = self.by_worker.pop(worker, None)
-        if job is None:
-            return None
-        self._reassigned.discard(job.number)
-        self._free_slots(job)
-        if self.by_object.get(job.object) is not job:
-            return None
-        del self.by_object[job.object]
-        return job
+        jobs = list(self.by_worker.pop(worker, {}).values())
+        for job in jobs:
+            self._reassigned.discard(job.number)
+            self._free_slots(job)
+        lost = [job for job in jobs if self.by_object.get(job.object) is job]
+        for job in lost:
+            del self.by_object[job.object]
+        return lost
 
     def deadlines(self) -> dict[str, float]:
         """End of the lease [s, monotonic] of each busy worker."""
-        return {worker: job.deadline for worker, job in self.by_worker.items()}
+        return {worker: max(job.deadline for job in jobs.values()) for worker, jobs in self.by_worker.items()}
 
     def _free_expired(self, worker: str, number: int) -> None:
-        # A worker does its jobs one after another: having answered this one it writes to no slot of an earlier one.
+        # A worker does its jobs in about the order in which they came: having answered this one it hardly writes to a
+        # slot of an earlier one whose lease is over, and what it would spoil then does not fit its checksum.
         expired = self._expired.get(worker, [])
         for old in [old for old in expired if old.number <= number]:
             expired.remove(old)

@@ -15,6 +15,7 @@ class WorkerTiming:
     def __init__(self) -> None:
         self._seconds: dict[str, dict[str, float]] = {}  # by object, then by worker
         self._slowness: dict[str, float] = {}
+        self._factorizations: dict[str, float] = {}  # s, running mean of what each worker reports
 
     def record(self, worker: str, object: str, seconds: float, factorization: float | None = None) -> None:
         """Adds the measured time of an answered job.
@@ -22,6 +23,10 @@ class WorkerTiming:
         factorization: time [s] that the worker reports for the factorization alone. It counts for the first job of
             an object at a worker, which took an analysis too.
         """
+        if factorization is not None:
+            mean = self._factorizations.get(worker)
+            step = 0.0 if mean is None else WEIGHT * (factorization - mean)
+            self._factorizations[worker] = factorization if mean is None else mean + step
         of_object = self._seconds.setdefault(object, {})
         if factorization is not None and worker not in of_object:
             seconds = min(seconds, factorization)
@@ -36,12 +41,17 @@ class WorkerTiming:
     def forget_worker(self, worker: str) -> None:
         """Drops a worker that left; another process of that name may be on another machine."""
         self._slowness.pop(worker, None)
+        self._factorizations.pop(worker, None)
         for of_object in self._seconds.values():
             of_object.pop(worker, None)
 
     def forget_object(self, object: str) -> None:
         """Drops an object that has a new epoch, and perhaps another size."""
         self._seconds.pop(object, None)
+
+    def mean_factorization(self, worker: str) -> float | None:
+        """Running mean of the times [s] that a worker reports for factorizations; None: it has reported none."""
+        return self._factorizations.get(worker)
 
     def slowness(self, worker: str) -> float:
         """Time of a worker over that of the fastest; 1 for workers that were not compared yet."""

@@ -375,7 +375,8 @@ class Service:
         contact = self.telemetry.contact
         undone = [*contact.count_clipped(records), *contact.crowded_nodes(), *contact.broken_ties()]
         told = [*self.telemetry.count_unconverged(records), *self.telemetry.halved(records)]
-        for line in [*told, *self.telemetry.many_substeps(), *undone]:
+        told += [*self.telemetry.gained_energy(records), *self.telemetry.many_substeps()]
+        for line in [*told, *undone]:
             log.warning("%s", line)
         for line in [*self.telemetry.count_runaways(records), *self.telemetry.not_finite(records)]:
             log.error("%s", line)

@@ -16,7 +16,7 @@ from sim_server.arrays import Float64
 from sim_server.backends.kinds import SLACK_OF_ENERGY
 from sim_server.checkpoint.file import Checkpoint
 from sim_server.mechanics.named_points import NamedPoints
-from sim_server.mechanics.world import Body
+from sim_server.mechanics.world import Body, World
 from sim_server.network.link import ServerLink
 from sim_server.parameters import ParameterUpdate
 from sim_server.recording import messages
@@ -91,6 +91,7 @@ class Telemetry:
         self.events = EventCounts()
         self._halved: set[int] = set()  # bodies of which it was said
         self._told_substeps = False
+        self._gained: set[int] = set()  # bodies of which it was said that they have gained energy
         self._has_listeners = False
         self._due = {"steps": 0.0, "state": 0.0, "status": 0.0, "look": 0.0}
         self._has_viewers = False
@@ -255,6 +256,7 @@ class Telemetry:
                 self.runaways.pop(body.index, None)
                 self.events.clear(body.index)
                 self._halved.discard(body.index)
+                self._gained.discard(body.index)
                 self._not_finite.discard(body.name)
         self.contact.on_reset()
         if self.replay_recorder:
@@ -412,6 +414,28 @@ class Telemetry:
         self.runaways.update(away["body"].tolist())
         return lines
 
+    def gained_energy(self, records: NDArray[Any]) -> list[str]:
+        """Returns a line for each object that has far more energy than it was given, kinetic and elastic together, for
+        the first time. Steps whose elastic energy is known; what moves little is not found by its kinetic energy."""
+        lines, world = [], self.simulation.world
+        if world.explicit or (world.loading and world.backend.name == "gpu"):
+            return []
+        energy = records["kinetic"] + records["elastic"]
+        for r in records[energy > SLACK_OF_ENERGY * np.maximum(records["budget"], 0.0)]:
+            body = world.bodies[int(r["body"])]
+            floor = least_energy(world, body)
+            if world.loading and world.load[body.nodes].any():  # the work of loads is known to a part alone
+                continue
+            if body.index in self._gained or not r["kinetic"] + r["elastic"] > 2 * r["budget"] + floor:
+                continue
+            self._gained.add(body.index)
+            lines.append(
+                f"object {body.name!r}, step {int(r['step'])}: it has {r['kinetic'] + r['elastic']:.3g} J, kinetic and "
+                f"elastic, where start and loads account for {r['budget']:.3g} J: an error of the time step. A smaller "
+                "dt or more linearizations may help"
+            )
+        return lines
+
     def many_substeps(self) -> list[str]:
         """Returns a line, once, if a step makes very many explicit substeps: while the first one is under way."""
         count, dt = self.engine.substeps, self.simulation.world.dt
@@ -457,6 +481,13 @@ def not_finite_lines(simulation: Simulation, records: NDArray[Any], known: set[s
                 "it goes back to where the step before began and rests there"
             )
     return lines
+
+
+def least_energy(world: World, body: Body) -> float:
+    """Energy of a body all of whose nodes move by a thousandth of its size in a step, below which a balance may be
+    rounding [J]; the floor of kernels/energy_balance.cuh."""
+    size = float(np.linalg.norm(np.ptp(world.rest[body.nodes], axis=0)))
+    return 0.5 * float(world.mass[body.nodes].sum()) * (1e-3 * size / world.dt) ** 2
 
 
 def cause_of(r: np.void) -> str:

@@ -8,8 +8,10 @@
 import logging
 import re
 from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
-from typing import Any
+from functools import partial
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,7 +34,19 @@ from sim_server.updates.useless_factors import UselessFactors
 
 log = logging.getLogger(__name__)
 
+LARGE = 4 << 20  # bytes of a factor whose check takes more than a few milliseconds
 MAX_CAUSES = 20  # reasons of missing factors that are logged of an object, each once
+
+
+class FactorUnderCheck(NamedTuple):
+    """A large factor that is checked beside the service thread.
+
+    memory: of the copy of its matrix, to be used again afterwards; None: there is none
+    """
+
+    factor: Factor
+    memory: NDArray[np.float64] | None
+    reason: Future[str]
 
 
 class Driver:
@@ -71,6 +85,8 @@ class Driver:
         self.on_epoch: list[Callable[[Body, int], None]] = []  # called before the first job of an epoch of a body
         self.snapshots = SnapshotPool(simulation, self.source, self.policy.expected_latency)
         self.useless_factors = UselessFactors(self)
+        self._checker = ThreadPoolExecutor(1, "checks of factors")
+        self._checks: list[FactorUnderCheck] = []  # oldest first
         self._observer = SolveObserver(self)
         self._warped = {b.name: b.index in simulation.warped for b in world.bodies}
 
@@ -114,7 +130,7 @@ class Driver:
         for state in self.bodies:
             if not state.frozen:
                 self.inline.submit(self.assembled_job(state))
-        self.receive(self.inline, self.adopt)
+        self.receive(self.inline, partial(self.adopt, now=True))
         self.engine.solve()
 
     def _new_records(self) -> NDArray[Any]:
@@ -175,6 +191,7 @@ class Driver:
     def receive(self, source: FactorSource, on_factor: Callable[[Factor], None]) -> None:
         """Passes on the factors that a source has made since the last call, and takes note of failed jobs and of
         patterns that factors will have."""
+        self._end_checks()
         for name, pattern in source.patterns():
             self.engine.expect_factors(self.by_name[name].body.index, pattern)
         for factor in source.poll():
@@ -182,17 +199,41 @@ class Driver:
         for name, reason in source.failures():
             self.fail(name, reason)
 
-    def adopt(self, factor: Factor) -> None:
+    def adopt(self, factor: Factor, now: bool = False) -> None:
         """Puts a factor into its body's mailbox, unless a newer one is there or the check refuses it.
 
-        The factor of a frozen body is not checked, since no solve uses it.
+        The factor of a frozen body is not checked, since no solve uses it. now: a large one, too, is checked before
+        this returns; else, where no step waits for it, that is done beside the caller.
         """
         state = self.by_name[factor.object]
+        is_new = factor.step > state.factors.newest and not state.frozen
+        beside = self.policy.free and factor.worker != Inline.WORKER and not now
+        if is_new and beside and factor.values.nbytes > LARGE:
+            memory, matrix = self.snapshots.hold(state, factor.step)
+            reason = self._checker.submit(self.check.reject_reason, factor, matrix)
+            self._checks.append(FactorUnderCheck(factor, memory, reason))
+            return
         self.policy.on_job_end()
         matrix = self.snapshots.release(state, factor.step)
-        # Check it, if it is to be used
-        is_new = factor.step > state.factors.newest and not state.frozen
-        if is_new and (why := self.check.reject_reason(factor, matrix)):
+        self._take_up(state, factor, self.check.reject_reason(factor, matrix) if is_new else "")
+
+    def _end_checks(self) -> None:
+        """Takes up the factors whose checks have ended."""
+        ended = [each for each in self._checks if each.reason.done()]
+        for check in ended:
+            self._checks.remove(check)
+            factor, state = check.factor, self.by_name[check.factor.object]
+            if check.memory is not None:
+                self.snapshots.recycle(check.memory)
+            if self.source.epoch(factor.object) not in (None, factor.epoch):
+                self.fail(factor.object, "it was of a mesh that was split since")
+                continue
+            self.policy.on_job_end()
+            self._take_up(state, factor, check.reason.result())
+
+    def _take_up(self, state: BodyUpdateState, factor: Factor, why: str) -> None:
+        """Puts a factor into its body's mailbox. why: it is not to be used; empty if it is."""
+        if why:
             self.useless_factors.on_rejected(factor)
             self.fail(factor.object, f"that of {factor.worker} is not used: {why}", refused=True)
             return

@@ -7,6 +7,7 @@ all of it; a factor that takes off less than block Jacobi does is worth less tha
 """
 
 import ctypes as c
+import threading
 from collections.abc import Mapping
 from functools import cache
 from typing import NamedTuple
@@ -61,6 +62,7 @@ class FactorCheck:
     ):
         self._patterns, self._alone = patterns if isinstance(patterns, Patterns) else Patterns(patterns), alone
         self._arrays: dict[int, tuple[Reals, Reals]] = {}  # by size: probe vector, work
+        self._lock = threading.Lock()  # of these
 
     def prepare(self) -> None:
         """Compiles the native check, so that the first factor does not wait for it."""
@@ -92,7 +94,11 @@ class FactorCheck:
         return ""
 
     def probe(self, factor: Factor, matrix: Reals | None) -> Probe:
-        """Applies a factor, which has the right size, to the probe vector r."""
+        """Applies a factor, which has the right size, to the probe vector r. From any thread."""
+        with self._lock:
+            return self._probe(factor, matrix)
+
+    def _probe(self, factor: Factor, matrix: Reals | None) -> Probe:
         row_start, columns = self._patterns.at(factor.object, factor.epoch)
         nodes = len(row_start) - 1
         n = 3 * nodes

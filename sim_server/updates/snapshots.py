@@ -68,7 +68,7 @@ class SnapshotPool:
     def discard(self, state: BodyUpdateState) -> None:
         """Gives up a copy that is not sent."""
         assert state.job.copy is not None
-        self._recycle(state.job.copy)
+        self.recycle(state.job.copy)
         state.job.copy = None
 
     def release(self, state: BodyUpdateState, step: int = -1) -> NDArray[np.float64] | None:
@@ -77,14 +77,25 @@ class SnapshotPool:
         if state.job.matrix is None:
             return None
         (copied, values), state.job.matrix = state.job.matrix, None
-        self._recycle(values)
+        self.recycle(values)
         return values if copied == step and values.ndim == 3 else None
+
+    def hold(
+        self, state: BodyUpdateState, step: int
+    ) -> tuple[NDArray[np.float64] | None, NDArray[np.float64] | None]:  # fmt: skip
+        """Returns the copy of the job in flight, which is over, and the same if it is the matrix of `step`. Its memory
+        is not used again before `recycle`."""
+        if state.job.matrix is None:
+            return None, None
+        (copied, values), state.job.matrix = state.job.matrix, None
+        return values, values if copied == step and values.ndim == 3 else None
 
     def _allocate(self, shape: tuple[int, ...]) -> NDArray[np.float64]:
         free = self._free.setdefault(shape, [])
         return free.pop() if free else np.full(shape, 0.0)
 
-    def _recycle(self, copy: NDArray[np.float64]) -> None:
+    def recycle(self, copy: NDArray[np.float64]) -> None:
+        """Has the memory of a copy used again."""
         if copy.base is None:  # not a view of the system's own values
             self._free.setdefault(copy.shape, []).append(copy)
 

@@ -390,6 +390,20 @@ def test_a_body_that_is_split_has_the_arrays_of_one_that_began_so(cupy, law, key
     written_back(sim)
 
 
+def test_steps_by_the_factor_alone_look_for_cuts_where_a_body_may_be_cut(cupy):
+    own = {}
+    for cuttable in (True, False):
+        given = cut_table("corotational", integrator={"scheme": "ros2"}, solver={"preconditioner": "cholesky"})
+        if not cuttable:
+            del given["object"][0]["effects"]["cutting"]
+        sim = Simulation(Scene.model_validate(given, context={"folder": "."}), "gpu")
+        own[cuttable] = sim.engine._stages._solve(0)
+        if cuttable:
+            known = sim.world.backend.known_twin(sim.cutting.changed_at)
+            assert own[True]["changed_at"] == known.data.ptr and known.dtype == np.float64
+    assert own[False]["changed_at"] == 0 and own[True]["clock"] != 0
+
+
 def test_a_scene_with_attachments_and_springs_alone_is_built(cupy):
     """They begin before islands are searched and end after all that moves nodes; nothing is detected."""
     simulation = Simulation.load("deploy/scenes/graft.toml", ["solver.precision=float32"], "gpu")

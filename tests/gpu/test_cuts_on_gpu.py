@@ -6,13 +6,15 @@ import pytest
 
 from protocol import messages_pb2 as pb
 from sim_server.effects.cutting import Cutting
-from sim_server.errors import InputError
 from sim_server.scene.model import Scene
+from sim_server.service.blades import Blades
 from sim_server.simulation import Simulation
 from sim_server.state.start import Start
 from sim_server.updates.driver import Driver
 from tests.cutting.cut_scenes import HALVED, LAWS, cut, table
 from tests.scenes import factor_of
+from tests.service.test_blades import advance, removed
+from tests.service.test_blades import made as blade
 
 pytestmark = pytest.mark.gpu
 NOTCH = "abs(X - 1) < 0.13 and Y > 0.25"
@@ -86,6 +88,17 @@ def test_nodes_without_elements_are_set_apart_from_a_factor_from_before(monkeypa
     assert 2 * found[True] < found[False]
 
 
+def test_an_edge_that_a_client_moves_removes_what_it_removes_on_a_cpu():
+    found = []
+    for device in ("gpu", "cpu"):
+        sim = blade(device)
+        looks = Blades(sim)
+        sim.contact.move("scalpel", (1.05, 0.45, 0.25), (1, 0, 0, 0))
+        advance(sim, looks, 30)
+        found.append(removed(sim))
+    assert found[0] == found[1] and len(found[0]) >= 6
+
+
 def test_a_reset_makes_whole():
     sim = made("corotational", "gpu")
     start = Start(sim)
@@ -98,6 +111,24 @@ def test_a_reset_makes_whole():
     np.testing.assert_array_equal(sim.fetch().x, first)
 
 
-def test_steps_by_the_factor_alone_are_refused():
-    with pytest.raises(InputError, match="ros2"):
-        made("corotational", "gpu", integrator={"scheme": "ros2"})
+@pytest.mark.parametrize("where", [NOTCH, HALVED])
+def test_steps_by_the_factor_alone_iterate_until_it_knows_of_the_cut(where):
+    """They come to what steps by iterations do on a CPU, as near as those by factors of another age do there."""
+    keys = {"integrator": {"scheme": "ros2"}, "solver": {"update": "lockstep-4", "preconditioner": "cholesky",
+            "tolerance": 1e-10, "max_iterations": 3000}}  # fmt: skip
+    sim = made("corotational", "gpu", **keys)
+    driver = Driver(sim)
+    before = driver.advance(20)
+    assert (before["form"][-4:] == pb.FACTOR).all()
+    cut(sim, where)
+    records = driver.advance(24)
+    forms, knows = records["form"], records["factor_step"] > 20
+    assert (forms[~knows] != pb.FACTOR).all() and (~knows).any()
+    assert (forms[knows] == pb.FACTOR).any(), "then steps need no iterations again"
+    assert (records["status"] == pb.CONVERGED).all()
+    by_iterations = keys | {"integrator": {"scheme": "ros2", "solve": "iterate"}}
+    twin = made("corotational", "cpu", **by_iterations)
+    twin.engine.run(20)
+    cut(twin, where)
+    twin.engine.run(24)
+    np.testing.assert_allclose(sim.fetch().x, twin.fetch().x, atol=6e-3)  # lockstep-4 and -5 on a CPU: 4e-3

@@ -69,6 +69,24 @@ def test_elastic_bodies_are_factorized_as_on_the_cpu(overrides, library):
     assert np.linalg.norm(x - expected) < 1e-3 * np.linalg.norm(expected)
 
 
+@pytest.mark.parametrize("graph", [GRAPHS["bar"], COMMON["chain"]], ids=["bar", "chain"])
+@arithmetic
+def test_many_together_are_to_the_bit_those_one_by_one(graph, library):
+    """In any number; one that is not positive definite is told, and the next ones are not spoilt by it."""
+    analysis = Analysis(*graph, library)
+    matrices = [spd(*graph, seed=seed) for seed in range(5)]
+    one_by_one = [analysis.factorize(matrix).copy() for matrix in matrices]
+    assert analysis.most >= 5
+    for count in (2, 5, 3, 1):
+        together = analysis.factorize_many(matrices[:count])
+        assert together is not None and len(together) == count
+        assert all(map(np.array_equal, together, one_by_one))
+    assert analysis.factorize_many([matrices[0], -matrices[1], matrices[2]]) is None
+    assert analysis.factorize_many([matrices[0], np.full_like(matrices[1], np.nan)]) is None
+    together = analysis.factorize_many(matrices[3:])
+    assert together is not None and all(map(np.array_equal, together, one_by_one[3:]))
+
+
 @arithmetic
 def test_the_same_matrix_gives_the_same_bits(library):
     graph = GRAPHS["bar"]

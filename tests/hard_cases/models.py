@@ -157,7 +157,7 @@ STOPPED = (
 )
 ON_THE_PARABOLA = (
     "Begun below the floor of J, where ln J goes on as a parabola that is no barrier: the line search stops in steps "
-    "that are not solved. It comes back at last."
+    "that are not solved, and the body is found to run away, told and frozen."
 )
 DRAWN = (
     "At three times their length these fibres are exp(32) times as stiff as at rest: some solves on the way back from "

@@ -1,12 +1,14 @@
 # SPDX-License-Identifier: MIT
 """The list of recipes has cases or tests for each, and each case has a recipe."""
 
+import re
 from pathlib import Path
 
 import pytest
 
 from tests.bench.hard_cases.film import TEN, failing
 from tests.bench.hard_cases.measuring import TABLES
+from tests.bench.hard_cases.texts import EXTREME_ROWS
 from tests.hard_cases.of_effects import run_effect_case
 from tests.hard_cases.recipe_table import RECIPES as ROWS
 from tests.hard_cases.recipes import RECIPES, recipe_of
@@ -21,6 +23,11 @@ def test_each_case_has_a_recipe_and_each_recipe_cases_or_tests() -> None:
     for number, recipe in enumerate(RECIPES, 1):
         assert recipe.tests or any(recipe_of(name) == number for name in NAMES)
         assert all((ROOT / path).exists() for path in recipe.tests)
+
+
+def test_files_that_the_page_names_are_there() -> None:
+    named = re.findall(r"`(tests/[\w/]+\.py)`", " ".join(row["tests"] for row in EXTREME_ROWS))
+    assert len(named) > 5 and all((ROOT / path).exists() for path in named)
 
 
 def test_seeds_begin_elsewhere_and_pull_elsewhere() -> None:

@@ -55,7 +55,7 @@ def test_answers_to_nothing_leave_the_job_alone(
     with pytest.raises(Refused) as refused:
         leases.match_answer(number, worker, epoch)
     assert refused.value.kind == kind
-    assert leases.by_object == {"beam": first} and leases.by_worker == {"w": first}
+    assert leases.by_object == {"beam": first} and leases.jobs == [first]
 
 
 def test_a_lease_that_ends_frees_object_and_worker_but_not_the_slots(leases: Leases, allocator: Allocator) -> None:
@@ -77,14 +77,24 @@ def test_an_answer_to_a_later_job_frees_the_slots_of_late_ones(leases: Leases, a
     assert sorted(map(str, allocator.back)) == ["slot 1", "slot 2"]
 
 
+def test_several_jobs_of_a_worker_are_answered_in_any_order(leases: Leases, allocator: Allocator) -> None:
+    first, second, third = (sent(leases, object=name, deadline=9.0 + k) for k, name in enumerate("abc"))
+    assert leases.count("w") == 3 and leases.deadlines() == {"w": 11.0}
+    leases.finish(leases.match_answer(second.number, "w", 1), 0.1)
+    assert leases.jobs == [first, third] and allocator.back == ["slot 2"]
+    assert leases.expire(9.5) == [first] and leases.count("w") == 1 and allocator.back == ["slot 2"]
+    assert leases.remove_worker("w") == [third] and leases.jobs == [] and leases.count("w") == 0
+    assert sorted(map(str, allocator.back)) == ["slot 1", "slot 2", "slot 3"]
+
+
 def test_leaving_frees_everything_of_the_worker(leases: Leases, allocator: Allocator) -> None:
     sent(leases, deadline=1.0)
     leases.expire(2.0)
     second = sent(leases, deadline=9.0)
     other = sent(leases, object="liver", worker="x")
-    assert leases.remove_worker("w") is second
+    assert leases.remove_worker("w") == [second]
     assert sorted(map(str, allocator.back)) == ["slot 1", "slot 2"]
-    assert leases.by_object == {"liver": other} and leases.remove_worker("w") is None
+    assert leases.by_object == {"liver": other} and leases.remove_worker("w") == []
 
 
 def test_a_new_epoch_frees_the_object_at_once_and_the_worker_when_it_answers(
@@ -104,7 +114,7 @@ def test_an_old_epoch_that_runs_out_or_is_lost_is_no_failure_of_the_new(leases: 
     leases.forget_object("beam")
     new = sent(leases, worker="x", deadline=9.0, epoch=2)
     assert leases.expire(2.0) == []
-    assert leases.remove_worker("w") is None
+    assert leases.remove_worker("w") == []
     assert leases.by_object == {"beam": new}
 
 
@@ -156,11 +166,11 @@ def test_an_object_waits_for_a_slow_worker_only_while_there_is_no_other(leases: 
     slow = sent(leases, worker="slow", deadline=99.0)  # exclusive until 0
     assert leases.reassign(0.1, lambda job: False) == [] and leases.by_object == {"beam": slow}
     assert leases.reassign(0.1, lambda job: True) == [slow]
-    assert leases.by_object == {} and leases.by_worker == {"slow": slow}, "it is busy"
+    assert leases.by_object == {} and leases.jobs == [slow], "it is busy"
     other = sent(leases, worker="good", deadline=99.0)
     assert leases.match_answer(slow.number, "slow", 1) is slow and leases.is_reassigned(slow)
     leases.finish(slow, 50.0)
-    assert leases.by_object == {"beam": other} and leases.by_worker == {"good": other}
+    assert leases.by_object == {"beam": other} and leases.jobs == [other]
     assert not leases.is_reassigned(slow)
     assert len(allocator.back) == 3
 

@@ -5,7 +5,7 @@ import logging
 import re
 import sys
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
@@ -138,6 +138,68 @@ def test_a_matrix_is_answered_with_its_factor(worker: Worker, connection: FakeCo
     assert (answer.step, answer.job, answer.worker, answer.dtype, answer.failure) == (10, 1, "w", "float32", "")
     assert answer.checksum == checksum(data) and answer.nonzeros == 6
     assert connection.patterns == [("beam", 1)] and connection.library == "diagonal"
+
+
+class Together(Diagonal):
+    """Factorizes up to three matrices of one pattern together."""
+
+    most = 3
+    sizes: ClassVar[list[int]] = []
+
+    def factorize_many(self, values: list[np.ndarray], dtype: Any) -> list[np.ndarray] | None:
+        self.sizes.append(len(values))
+        try:
+            return [self.factorize(each, dtype) for each in values]
+        except ValueError:
+            return None
+
+
+@pytest.fixture
+def together(connection: FakeConnection) -> Worker:
+    worker = Worker(connection, Together)  # type: ignore[arg-type]
+    connection.received.put(ServersThere((7,)))
+    worker.step(0.0)
+    Together.sizes = []
+    drain(worker, connection, *(matrix(k + 1, name) for k, name in enumerate("abcd")))  # analyses
+    assert Together.sizes == []
+    connection.answers.clear()
+    return worker
+
+
+def test_objects_of_one_pattern_are_factorized_together(together: Worker, connection: FakeConnection) -> None:
+    for k, name in enumerate("abcd"):
+        connection.received.put(matrix(10 + k, name, scale=4.0 + k))
+    together.step(0.0)
+    together.step(0.0)
+    assert Together.sizes == [3]
+    for k, (answer, data) in enumerate(connection.answers):
+        assert (answer.header.object, answer.job, answer.failure) == ("abcd"[k], 10 + k, "")
+        np.testing.assert_array_equal(np.frombuffer(data, np.float32), np.float32(np.sqrt(4.0 + k)))
+    assert len(connection.answers) == 4 and connection.counters.jobs == 8 and connection.received.idle
+
+
+def test_one_without_a_factor_does_not_spoil_those_of_others(together: Worker, connection: FakeConnection) -> None:
+    for k, name in enumerate("abc"):
+        connection.received.put(matrix(10 + k, name, scale=-4.0 if name == "b" else 4.0))
+    together.step(0.0)
+    failures = {answer.header.object: bool(answer.failure) for answer, _ in connection.answers}
+    assert failures == {"a": False, "b": True, "c": False} and Together.sizes == [3]
+
+
+def test_a_spoiled_matrix_does_not_spoil_those_of_others(together: Worker, connection: FakeConnection) -> None:
+    for k, name in enumerate("abc"):
+        connection.received.put(matrix(10 + k, name, **({"checksum": 1} if name == "b" else {})))
+    together.step(0.0)
+    failures = {answer.header.object: answer.failure for answer, _ in connection.answers}
+    assert "checksum" in failures["b"] and failures["a"] == failures["c"] == ""
+
+
+def test_other_types_are_not_factorized_together(together: Worker, connection: FakeConnection) -> None:
+    for k, name in enumerate("abc"):
+        connection.received.put(matrix(10 + k, name, factor_dtype="float64" if name == "b" else "float32"))
+    together.step(0.0)
+    together.step(0.0)
+    assert Together.sizes == [2] and len(connection.answers) == 3
 
 
 def test_it_is_idle_when_nothing_came_or_waits_or_is_at_work(connection: FakeConnection) -> None:

@@ -22,11 +22,11 @@ BLADE = {
 }  # fmt: skip
 
 
-def made(**blade: Any) -> Simulation:
+def made(device: str = "cpu", **blade: Any) -> Simulation:
     """A bar along x, 0.5 m high, under a blade; nothing pulls at it."""
     given = table(own={"corotational": {"young": 2e6, "poisson": 0.3}}, effects={"contact": {"between": False}})
     given["solver"] = {"preconditioner": "block_jacobi"}
-    return Simulation(Scene.model_validate(given | {"obstacle": [BLADE | blade]}, context={"folder": "."}))
+    return Simulation(Scene.model_validate(given | {"obstacle": [BLADE | blade]}, context={"folder": "."}), device)
 
 
 def removed(sim: Simulation) -> list[int]:

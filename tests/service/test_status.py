@@ -11,8 +11,11 @@ from rich.console import Console
 from clients.watch import tables
 from protocol import messages_pb2 as pb
 from sim_server.recording import messages
+from sim_server.scene.model import Scene
 from sim_server.service.telemetry import Telemetry
+from sim_server.simulation import Simulation
 from sim_server.updates.driver import Driver
+from tests.hard_cases.effect_table import EFFECT_CASES
 from tests.scenes import bar, simulation
 
 
@@ -135,3 +138,21 @@ def test_few_explicit_substeps_are_not_told():
     telemetry = Telemetry(Driver(sim), SimpleNamespace(), None, patient=False)  # type: ignore[arg-type]
     sim.engine.run(2)
     assert sim.engine.substeps > 0 and telemetry.many_substeps() == []
+
+
+def test_energy_from_nowhere_is_told_once_though_the_body_hardly_moves():
+    """A cube crushed by a cable, with one linearization a step: all is converged, and it springs to and fro."""
+    case = next(case for case in EFFECT_CASES if case.name == "cable drawn in")
+    table = {"name": "case", "dt": 0.01, **case.scene(np.random.default_rng(4))}
+    sim = Simulation(
+        Scene.model_validate(table | {"solver": {"preconditioner": "block_jacobi"}}, context={"folder": "."})
+    )
+    sim.engine.loop.energy_every = 1
+    telemetry, told = Telemetry(Driver(sim), SimpleNamespace(), None, patient=False), []  # type: ignore[arg-type]
+    for step in range(40):
+        case.act(sim, step)
+        sim.engine.run(1)
+        records = sim.engine.records()
+        told += [(step, line) for line in telemetry.gained_energy(records)]
+        assert records["status"][0] == pb.CONVERGED
+    assert len(told) == 1 and told[0][0] > 15 and "kinetic and elastic" in told[0][1]

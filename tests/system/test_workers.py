@@ -6,8 +6,10 @@ import logging
 import os
 import re
 import signal
+import threading
 import time
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -20,7 +22,9 @@ from protocol.refused import Refused
 from protocol.shared_memory import limits as shm_limits
 from protocol.shared_memory import probe as shm_probe
 from protocol.shared_memory.pool import Slot
+from sim_server.network import dispatch
 from sim_server.network.link import ServerLink
+from sim_server.updates.factor_source import Job
 
 pytestmark = pytest.mark.system
 shared = pytest.mark.skipif(bool(shm_limits.obstacle()), reason=f"no shared memory here: {shm_limits.obstacle()}")
@@ -51,6 +55,62 @@ def test_matrices_and_factors_go_through_shared_memory() -> None:
         assert (worker.bulk_shared, worker.bulk_copied) == (5, 0)
         assert (link.counters.bulk_shared, link.counters.bulk_copied) == (9, 1)
         assert link.counters.refused == 0 and driver.failures == []
+
+
+@shared
+def test_several_small_objects_wait_at_one_worker(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Jobs of all of them are in flight at once, and each factor is that of its own matrix."""
+    monkeypatch.setattr(dispatch, "QUEUE_SECONDS", 60.0)
+    endpoint, names = free_endpoint(), [f"beam{k}" for k in range(12)]
+    beams = [chain(object=name) for name in names]
+    with ServerLink(listen=[endpoint]) as link, light_worker(endpoint):
+        driver = Driver(link)
+        for beam in beams:
+            link.announce(beam)
+        assert driver.factor(beams[0], 1).worker == "light"
+        assert link.dispatch.ready() >= len(beams), "its factorizations take no minute, so it has room for all"
+        for k, beam in enumerate(beams):
+            assert link.dispatch.submit(Job(names[k], 1, 2, True, matrix(beam, 0.1 * k)))
+        driver.until(lambda: len(driver.factors) == 1 + len(beams), "all factors")
+        for factor in driver.factors[1:]:
+            k = names.index(factor.object)
+            assert np.allclose(product(factor), dense(beams[k], matrix(beams[k], 0.1 * k)), atol=1e-5)
+        assert driver.failures == [] and link.counters.refused == 0
+        large = chain(nodes=8000, object="large")
+        link.announce(large)
+        assert link.dispatch.ready() == 1, "beside a large object each waits for the one before"
+
+
+def test_large_factors_are_decoded_beside_the_caller(monkeypatch: pytest.MonkeyPatch) -> None:
+    """All count as large here; while one is decoded, a second answer to its job is refused."""
+    monkeypatch.setattr(dispatch, "LARGE", 0)
+    endpoint = free_endpoint()
+    with ServerLink(listen=[endpoint]) as link, HandWorker(endpoint, link.incarnation) as hand:
+        driver = Driver(link)
+        link.announce(BEAM)
+        hand.hello()
+        driver.until(link.dispatch.ready, "the worker")
+        driver.submit(BEAM, 1)
+        answer, values = hand.right_answer(hand.receive(), BEAM)
+        decoding, decode = threading.Event(), link.dispatch._decoder.decode
+
+        def slow(*arguments: Any) -> Any:
+            assert decoding.wait(30)
+            return decode(*arguments)
+
+        monkeypatch.setattr(link.dispatch._decoder, "decode", slow)
+        hand.answer(answer, values)
+        hand.answer(answer, values)
+        driver.until(lambda: link.counters.refusals["duplicate"] == 1, "the second answer")
+        assert driver.factors == [] and link.dispatch.ready() == 0
+        decoding.set()
+        driver.until(lambda: driver.factors, "the factor")
+        assert np.allclose(product(driver.factors[0]), dense(BEAM, matrix(BEAM)), atol=1e-5)
+        driver.submit(BEAM, 2)
+        answer, values = hand.right_answer(hand.receive(), BEAM)
+        hand.answer(answer, 2 * values)
+        driver.until(lambda: driver.failures, "the spoiled one")
+        assert "was refused" in driver.failures[0][1] and len(driver.factors) == 1
 
 
 @shared

@@ -6,7 +6,10 @@ factor).
 """
 
 import logging
+import threading
 import time
+from concurrent.futures import wait
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -17,6 +20,7 @@ from protocol.factor import Factor
 from sim_server.backends.cpu.structs import RECORD
 from sim_server.backends.kinds import Kind
 from sim_server.simulation import Simulation
+from sim_server.updates import driver as driver_module
 from sim_server.updates.driver import Driver
 from sim_server.updates.factor_source import Inline, Job
 from sim_server.updates.policies.free_running import MAX_REQUESTS
@@ -418,6 +422,50 @@ def test_an_older_factor_does_not_replace_a_newer_one():
         driver.adopt(made(driver, step, values))
         assert driver.advance(1)["factor_step"].tolist() == [used]
     assert driver.bodies[0].factors.used == 2
+
+
+@pytest.fixture
+def sent(monkeypatch) -> tuple[Driver, Factor, threading.Event]:
+    """A driver of which a job is in flight, its factor as of a worker, and what lets its check go on. All factors
+    count as large."""
+    monkeypatch.setattr(driver_module, "LARGE", 0)
+    sim = falling(update="async")
+    driver = Driver(sim, Idle(patterns_of(sim), 1))
+    driver.advance(3)
+    state, go = driver.bodies[0], threading.Event()
+    assert state.job.matrix is not None
+    step, values = state.job.matrix
+    factor = replace(made(driver, step, values), worker="w")
+    check = driver.check.reject_reason
+
+    def slow(*arguments: Any) -> str:
+        go.wait(30)
+        return check(*arguments)
+
+    monkeypatch.setattr(driver.check, "reject_reason", slow)
+    return driver, factor, go
+
+
+def test_large_factors_are_checked_beside_the_steps(sent):
+    driver, factor, go = sent
+    memory = driver.bodies[0].job.matrix[1]
+    driver.adopt(factor)
+    assert driver.advance(2)["factor_step"].tolist() == [-1, -1]
+    assert all(memory is not free for kept in driver.snapshots._free.values() for free in kept), "it is being read"
+    go.set()
+    wait([each.reason for each in driver._checks])
+    assert driver.advance(1)["factor_step"].tolist() == [factor.step]
+    assert any(memory is free for kept in driver.snapshots._free.values() for free in kept)
+    assert driver.bodies[0].factors.used == 1 and driver._checks == []
+
+
+def test_a_large_factor_that_is_no_use_is_refused_beside_the_steps(sent):
+    driver, factor, go = sent
+    driver.adopt(replace(factor, values=np.full_like(factor.values, np.nan)))
+    go.set()
+    wait([each.reason for each in driver._checks])
+    assert driver.advance(2)["factor_step"].tolist() == [-1, -1]
+    assert driver.bodies[0].failures.refused == 1 and not driver.bodies[0].job.in_flight
 
 
 def test_excess_iterations_are_summed_until_the_next_matrix_goes_out():

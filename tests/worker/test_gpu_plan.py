@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from precond_worker.factorization.factorize import Analysis
 from precond_worker.gpu.assembly_tree import WIDTH, AssemblyTree, assembly_tree
+from precond_worker.gpu.copies import copies
 from precond_worker.gpu.plan import MultifrontalPlan, levels, make_plan
 from precond_worker.symbolic.elimination import eliminate
 from precond_worker.symbolic.ordering import order_nodes
@@ -48,6 +49,18 @@ def test_solutions_are_those_of_the_cpu(graph):
     cpu = Analysis(*graph)
     expected = supernodal.solve(cpu.pattern, cpu.factorize(values, np.float64), b)
     np.testing.assert_allclose(supernodal.solve(factor_pattern, multifrontal.factorize(plan, values), b), expected)
+
+
+@graphs
+def test_copies_of_a_pattern_are_factorized_as_if_each_were_alone(graph):
+    """Bit by bit, in the order of the copies."""
+    tree, factor_pattern, plan = made(graph)
+    many = copies(tree, *graph, 3)
+    values = [spd(*graph, seed=seed) for seed in (5, 6, 7)]
+    found = multifrontal.factorize(make_plan(many.tree, many.row_start, many.columns), np.concatenate(values))
+    assert found.shape == (3 * factor_pattern.nonzeros,)
+    for factor, matrix in zip(found.reshape(3, -1), values, strict=True):
+        assert np.array_equal(factor, multifrontal.factorize(plan, matrix))
 
 
 def test_only_one_of_mirrored_values_is_read_the_same_as_on_the_cpu():

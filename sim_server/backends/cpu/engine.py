@@ -68,13 +68,10 @@ class NativePattern:
 
     def __init__(self, pattern: FactorPattern, threads: int = 0):
         self.pattern = pattern
-        width, height = np.diff(pattern.super_start).astype(np.int64), np.diff(pattern.row_start)
-        sizes = width * height - width * (width - 1) // 2
-        self._value_start = np.concatenate([[0], np.cumsum(sizes)[:-1]]).astype(np.int64)
         self.native = structs.Pattern(
-            size=pattern.size, supernodes=len(width), permutation=pattern.permutation.ctypes.data,
+            size=pattern.size, supernodes=len(pattern.super_start) - 1, permutation=pattern.permutation.ctypes.data,
             super_start=pattern.super_start.ctypes.data, row_start=pattern.row_start.ctypes.data,
-            rows=pattern.rows.ctypes.data, value_start=self._value_start.ctypes.data,
+            rows=pattern.rows.ctypes.data, value_start=pattern.value_start.ctypes.data,
         )  # fmt: skip
         if threads and pattern.size >= SHARED_SIZE:
             library = _library()
@@ -450,7 +447,7 @@ class _NativeRefresh:
         for name, array in self._room.items():
             setattr(self._nodes, name, array.ctypes.data)
         self.native = structs.KnownDiagonals(
-            kept=KNOWN_DIAGONALS, score=self._score.ctypes.data, room=c.addressof(self._nodes),
+            kept=KNOWN_DIAGONALS, slow=-1, score=self._score.ctypes.data, room=c.addressof(self._nodes),
             **{name: array.ctypes.data for name, array in self.carried.items()},
         )  # fmt: skip
         body.correction.known = c.addressof(self.native)

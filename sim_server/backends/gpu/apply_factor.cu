@@ -49,11 +49,13 @@ struct FactorApplication {
         for (int k = threadIdx.x; k < 3 * range.own; k += THREADS) s.y[begin + k] = value;
     }
 
-    // True if a grab pulls at an own node by a spring.
+    // True if a grab pulls at an own node by a spring, or it loses elements in this step.
     static __device__ __forceinline__ bool pulled(const StageSolve& t, const PcgBody& body, const RowRange& range) {
         bool found = false;
         if (t.spring)
             for (int k = threadIdx.x; k < range.own; k += THREADS) found |= t.spring[body.first + range.begin + k] != 0;
+        if (t.changed_at)
+            for (int k = threadIdx.x; k < range.own; k += THREADS) found |= t.changed_at[body.first + range.begin + k] == *t.clock;
         return found;
     }
 

@@ -216,7 +216,7 @@ class GpuEngine(DeviceLoop):
         if stages and given.euler and stage_results is not None:
             self._stages = RosenbrockStep(
                 gpu, device, stages, given.euler, assemble, self.solver, self._epilogue, stage_results, given.energies,
-                gpu.twin(arrays["b"]),
+                gpu.twin(arrays["b"]), given.cut,
             )  # fmt: skip
             self._stamp_begin = self._stages.stamp_begin
         else:

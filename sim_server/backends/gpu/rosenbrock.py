@@ -12,7 +12,7 @@ from typing import Any, Protocol, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_server.backends.base import Launch
+from sim_server.backends.base import CutInput, Launch
 from sim_server.backends.declarations import Declarations
 from sim_server.backends.energies import Energies
 from sim_server.backends.euler_form import EulerForm
@@ -53,6 +53,7 @@ class RosenbrockStep:
     results: host memory (capacity, bodies) of STAGE_RESULT that the steps write to
     energies: arrays of the scene
     b: device array (nodes, 3) of the right-hand sides
+    cut: what tells when nodes lost elements; None: no body can be cut
 
     alone: True if the first attempt is made by factors alone; A is then assembled only for bodies that iterate
     """
@@ -60,6 +61,7 @@ class RosenbrockStep:
     def __init__(
         self, gpu: Gpu, device: Branches, stages: Rosenbrock, euler: EulerForm, assemble: Sequence[DeviceLaunch],
         solver: PcgSolver, end: NDArray[Any], results: NDArray[Any], energies: Energies, b: DeviceArray,
+        cut: CutInput | None = None,
     ):  # fmt: skip
         cp, bodies = gpu.cp, len(stages.bound)
         self._gpu, self._device, self._stages, self._solver, self._end = gpu, device, stages, solver, end
@@ -81,6 +83,8 @@ class RosenbrockStep:
         }  # fmt: skip
         if "spring" in energies.touch:
             self._solve_memory["spring"] = gpu.twin(energies.touch["spring"])
+        if cut:
+            self._solve_memory["changed_at"] = gpu.twin(cut.changed_at)
         self._results, self._nodes = results, finish.items
         self._coefficients = gpu.twin(euler.coefficients)
         pairs = (euler.coefficients, np.array(euler.euler_coefficients))
@@ -156,6 +160,7 @@ class RosenbrockStep:
         stage = np.zeros((), STAGE_SOLVE)
         for name, array in self._solve_memory.items():
             stage[name] = array.data.ptr
+        stage["clock"] = self._end["clock"]
         stage["form"], stage["first_of_step"], stage["first_of_attempt"] = form, first_of_step, first_of_attempt
         return stage
 

@@ -19,10 +19,10 @@ enum StepPhase { OPEN = 0, MADE = 2 };  // of a body in a step; MADE is DONE of 
 struct StageState {          // of a body
     int form;                // StepForm of its attempt
     int patience;            // steps to come that iterate
-    int springs;             // 1: a grab pulls at it by a spring in this step
+    int springs;             // 1: a grab pulls at it by a spring in this step, or elements were removed
     int unused;
     long long factor_step;   // of the factor of the last step, -1: none
-    long long spring_step;   // last step with such a spring, -1: none
+    long long spring_step;   // last step with such a spring or cut, -1: none
     double estimate;         // of the last attempt [m]
     double inconsistency;    // of its first stage, |y . (b - A y)| / |y . b|, if by the factor
 };
@@ -31,6 +31,8 @@ struct StageSolve {          // what the solves of an attempt have beside PcgArg
     StageState* state;       // (bodies,)
     const int* phase;        // (bodies,) StepPhase
     const real* spring;      // (nodes,) of grabs [N/m]; null: nothing can be touched
+    const double* changed_at; // (nodes,) when the node last lost or got back an element [s]; null: none does
+    const double* clock;     // (1,) [s]
     const real* mass;        // (nodes,) [kg]
     const real* share;       // (nodes,) theta of mechanics/rosenbrock.py
     const real* weight;      // (nodes,) w likewise
@@ -50,7 +52,7 @@ struct StageSolve {          // what the solves of an attempt have beside PcgArg
 DECIDES long long factor_step_of(const PcgBody& body) { return body.plan ? body.factor_step : -1; }
 
 // Whether the factor may stand in for A in this step. It does not know the springs of grabs that were there when it was made and
-// have gone, nor those that have come.
+// have gone, nor those that have come, nor cuts since.
 DECIDES bool may_use_factor(const StageState& s, const PcgBody& body) {
     const long long step = factor_step_of(body);
     return step >= 0 && body.kind == CHOLESKY && step > s.spring_step && (s.patience == 0 || s.factor_step != step);

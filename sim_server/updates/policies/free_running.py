@@ -15,7 +15,7 @@ from sim_server.updates.scheduler import UpdateRequest, is_worthwhile, max_facto
 if TYPE_CHECKING:
     from sim_server.updates.driver import Driver
 
-MAX_REQUESTS = 32  # matrices that the loop may be asked to copy within one step
+MAX_REQUESTS = 64  # matrices that the loop may be asked to copy within one step
 MAX_WAIT = 2  # steps that a copied matrix may wait for a worker
 
 
@@ -28,6 +28,7 @@ class Async(UpdatePolicy):
         super().__init__(driver, n)
         self.prefetch = PrefetchDepth()
         self._exhausted = -1  # step at which no body was left to be asked for its matrix
+        self._choice_due = 0.0  # s; time before which `pump` chooses no bodies
 
     def step(self) -> None:
         """Makes a step after an exchange with the workers."""
@@ -39,11 +40,20 @@ class Async(UpdatePolicy):
         driver = self.driver
         if self.prefetch.on_step(driver.engine.step, time.monotonic()) and not driver.counted:
             self.prefetch.update([s.factors.cost.value for s in driver.bodies], driver.source.worker_count())
-        self.exchange()
+        self._exchange_copies()
+        if (begin := time.monotonic()) >= self._choice_due:
+            self._choose()  # of a thousand bodies it takes milliseconds: half of the time is kept for all else
+            end = time.monotonic()
+            self._choice_due = 2 * end - begin
 
     def exchange(self) -> None:
         """Takes up factors, sends the matrices that were copied, requests those of the most urgent bodies."""
-        driver, source, solver = self.driver, self.driver.source, self.driver.solver
+        self._exchange_copies()
+        self._choose()
+
+    def _exchange_copies(self) -> None:
+        """Takes up factors and sends the matrices that were copied."""
+        driver, source = self.driver, self.driver.source
         # Take up factors; bodies whose worker is slow may be sent again
         driver.receive(source, self.on_factor)
         for name in source.reassigned():
@@ -51,6 +61,10 @@ class Async(UpdatePolicy):
             driver.by_name[name].on_reassignment()
             self.on_job_end()
         self._send_copies()
+
+    def _choose(self) -> None:
+        """Requests the matrices of the most urgent bodies."""
+        driver, source, solver = self.driver, self.driver.source, self.driver.solver
         # Count the places: idle workers without a copy on the way, and copies to hold in advance
         step, waiting = driver.engine.step, sum(s.job.copy is not None for s in driver.bodies)
         idle = max(min(source.ready(), MAX_REQUESTS) - waiting, 0)

@@ -1,15 +1,18 @@
 # SPDX-License-Identifier: MIT
 """What each effect costs in a scene that lists it, and that it costs nothing in one that does not."""
 
+import multiprocessing
 import tempfile
+from concurrent.futures import ProcessPoolExecutor
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
 from sim_server.effects import known_effects
-from tests.bench.effects.absence import absence
-from tests.bench.effects.cost import Row, cost
+from tests.bench.effects.cost import Row
+from tests.bench.effects.measured import measured
 from tests.bench.harness.report import Report, plots
 from tests.support.absent_effect import copy_packages
 from tests.support.effect_samples import SAMPLES, Cells
@@ -50,6 +53,7 @@ def main(
         int, typer.Option(min=2, help="Batches of steps of each scene; without an effect twice as many")
     ] = 30,
     starts: Annotated[int, typer.Option(min=1, help="Pairs of processes without an effect")] = 3,
+    jobs: Annotated[int, typer.Option(min=1, help="Effects measured at a time, each on cores of its own")] = 1,
     quick: Annotated[bool, typer.Option("--quick", help="A small smoke run")] = False,
     out: Annotated[Path | None, typer.Option(help="Folder of the results [default: out/bench/effects]")] = None,
 ) -> None:
@@ -60,18 +64,19 @@ def main(
         cells, rounds, starts = (1, 1, 4), 2, 1
     if missing := sorted(set(names) - set(SAMPLES)):
         raise typer.BadParameter(f"no samples of {', '.join(missing)} in tests/support/effect_samples.py")
-    told = {"tets": 6 * cells[0] * cells[1] * cells[2], "rounds": rounds, "starts": starts}
+    told = {"tets": 6 * cells[0] * cells[1] * cells[2], "rounds": rounds, "starts": starts, "jobs": jobs}
     report = Report("effects", "What each effect costs", told | ({"effect": effects} if effects else {}), out, quick)
     costs, absences = [], []
     with tempfile.TemporaryDirectory() as folder:
-        whole = Path(folder) / "whole"
-        copy_packages(whole)
-        for name in names:
-            costs.append(cost(name, cells, rounds, Path(folder)))
-            absences.append(absence(name, cells, 2 * rounds, starts, whole, Path(folder)))
-            print(
-                f"{name}: {costs[-1]['ratio']:.3f} with it, {absences[-1]['ratio']:.3f} without its files", flush=True
-            )
+        copy_packages(Path(folder) / "whole")
+        measure = partial(measured, cells, rounds, starts, Path(folder))
+        with ProcessPoolExecutor(jobs, multiprocessing.get_context("spawn")) as pool:
+            for row, absent in pool.map(measure, names) if jobs > 1 else map(measure, names):
+                costs.append(row)
+                absences.append(absent)
+                print(
+                    f"{row['effect']}: {row['ratio']:.3f} with it, {absent['ratio']:.3f} without its files", flush=True
+                )
     report.say("## Listed", COSTS)
     report.table(costs)
     report.figure(diagram(costs), "effects.png", "What each effect adds to the time of a step.")

@@ -2,8 +2,8 @@
 """How long a server on a GPU goes without a factor, and how long clients wait for answers meanwhile.
 
 A server of its own runs a beam in real time with one worker on the same GPU. A client asks for a status all the time
-from when the server answers for the first time. Each run has a cache folder of its own for orders of elimination unless
-it is warm; compiled kernels are there in both.
+from when the server answers a command for the first time. Kernels and orders of elimination are in their caches if an
+earlier run has put them there.
 """
 
 import argparse
@@ -53,6 +53,7 @@ def measure(tets: int, first: str = "go", device: str = "gpu", worker: str = "gp
 def _watched(endpoint: str, seconds: float) -> Row:
     client = _client(endpoint)
     with client:
+        _answering(client)
         begun, used, waits, failed, ages = time.monotonic(), None, [], 0, []
         factors: list[tuple[float, int]] = []
         step_of_use = -1
@@ -82,6 +83,18 @@ def _watched(endpoint: str, seconds: float) -> Row:
             "step ms p50": 1e3 * status.step_p50, "step ms p99": 1e3 * status.step_p99,
             "step ms max": 1e3 * status.step_max, "late steps": int(status.late_steps),
         }  # fmt: skip
+
+
+def _answering(client: Client) -> None:
+    """Waits until the server answers commands: until then it has not begun."""
+    end = time.monotonic() + PATIENCE
+    while True:
+        try:
+            client.command("status")
+            return
+        except ClientError:
+            if time.monotonic() > end:
+                raise
 
 
 def _client(endpoint: str) -> Client:

@@ -64,6 +64,7 @@ def main(
     device: Annotated[str, typer.Option(help="cpu or gpu")] = "cpu",
     precision: Annotated[list[str] | None, typer.Option(help="Of a GPU, one or more [default: float64]")] = None,
     only: Annotated[list[str] | None, typer.Option(help=f"Of {', '.join(KINDS)} [default: all but long]")] = None,
+    name: Annotated[list[str] | None, typer.Option(help="Beginnings of names of cases [default: all]")] = None,
     seeds: Annotated[int, typer.Option(min=1, help="Of cases and effects")] = SEEDS,
     jobs: Annotated[int, typer.Option(min=1, help="Processes")] = 1,
     limit: Annotated[float, typer.Option(min=0, help="Seconds after which nothing new begins, 0: no limit")] = 0,
@@ -79,6 +80,7 @@ def main(
     wanted = quickly() if quick else [
         job for kind in kinds for p in precisions for job in jobs_of(kind, device, p, seeds)
     ]  # fmt: skip
+    wanted = [job for job in wanted if job.name.startswith(tuple(name or [""]))]
     told = {"device": device, "precision": " ".join(precisions), "only": " ".join(kinds), "seeds": seeds, "jobs": jobs}
     report = Report("hard_cases", "Hard cases", told, out, quick)
     begun = report.head()

@@ -1,8 +1,9 @@
 // SPDX-License-Identifier: MIT
 // An old factor is far from A where the body has changed most since its matrix: a few hundredths of the nodes at the joints of stiff and
 // soft material carry the eigenvalues that cost iterations. There an exact solve on T, these nodes, is put around the factor, as after cuts
-// (cut_nodes.h). A solve that has not come far in REFRESH_AFTER iterations goes over to it if it would otherwise need many more. What A
-// had on its diagonal is noted when a copy of it is taken for a worker, so that it is known once the factor comes.
+// (cut_nodes.h). A solve that has not come far in REFRESH_AFTER iterations goes over to it if it would otherwise need many more, and those
+// that follow with the same factor begin with it. What A had on its diagonal is noted when a copy of it is taken for a worker, so that it
+// is known once the factor comes.
 //
 // All decisions are by iterations, residuals and sizes, no clock, so that a run repeats.
 #pragma once
@@ -23,6 +24,7 @@ struct KnownDiagonals {    // of a body, at the copies taken last
     int32_t kept;          // copies
     int32_t refreshed;     // nodes on which the last solve was exact, 0: the factor was enough
     int64_t notes;         // so far
+    int64_t slow;          // step of the matrix of the factor with which a solve was slow last, -1: none was
     int64_t* step;         // (kept,) of the copies
     float* block;          // (kept, nodes, 6) upper triangles of the nodes' own blocks [kg]
     double* score;         // (nodes,) room

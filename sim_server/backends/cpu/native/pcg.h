@@ -156,12 +156,14 @@ static SolveResult pcg(const BlockCsr& A, const double* b, const Factor* factor,
 
     Preconditioner P{A, factor, out.kind, inverse, scratch, settings.omega, correction};
     P.prepare();
-    if (correction && correction->known) correction->known->refreshed = 0;
+    KnownDiagonals* const known = correction ? correction->known : nullptr;
+    if (known) known->refreshed = 0;
+    bool refreshed = known && P.kind == CHOLESKY && !bounded && from != APPLIED_START && known->slow == factor->step && P.refresh_locally();
     const double useful = bounded ? std::max(goal, USEFUL * USEFUL * b2) : goal;
     const double limit = settings.residual_limit > 0 ? settings.residual_limit * settings.residual_limit * b2 : INFINITY;
     double rz = 0, last_true = INFINITY, quarter = r2 * std::pow(useful / r2, 0.25);
     const double first_r2 = r2;
-    bool restart = true, switched = false, refreshed = false, applied = from == APPLIED_START;
+    bool restart = true, switched = false, applied = from == APPLIED_START;
     auto leave_factor = [&] {
         P.kind = out.kind = BLOCK_JACOBI;
         out.fallbacks = 1;
@@ -233,6 +235,7 @@ static SolveResult pcg(const BlockCsr& A, const double* b, const Factor* factor,
         if (r2 > goal && !enough) {
             if (is_slow() && P.refresh_locally()) {
                 refreshed = restart = true;
+                known->slow = factor->step;
                 error.forget();
             }
             continue;
