@@ -9,9 +9,9 @@ from contextlib import ExitStack
 from typing import NamedTuple, Self
 
 from precond_worker.network.connect import Connector
+from precond_worker.network.pool import Pool
 from precond_worker.network.server_addresses import EVERY, ServerAddress
 from precond_worker.network.server_connection import ServerConnection
-from precond_worker.pool import Pool
 from precond_worker.round_robin import RoundRobin
 from precond_worker.worker import Worker
 from protocol.counters import Counters

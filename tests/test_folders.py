@@ -22,7 +22,7 @@ ALLOWED = {  # what each folder imports of its package
     "precond_worker.factorization": {"arrays", "errors", "gpu", "symbolic"},
     "precond_worker.network": {"errors", "remote_assembly"},
     "clients.accuracy": {"errors", "load_test", "log", "progress", "watch"},
-    "clients.demo": {"client", "errors", "load_test", "log"},
+    "clients.demo": {"client", "errors", "grab", "load_test", "log"},
     "clients.examples": {"client", "errors", "grab", "log"},
     "clients.export": {"client", "errors", "log", "viewer"},
     "clients.haptics": {"client", "errors", "obstacle"},

@@ -32,14 +32,14 @@ def _of(path: Path, sticky: bool) -> str:
     if found.st_uid not in (os.geteuid(), 0):
         return f"{path} belongs to user {found.st_uid}, this process to user {os.geteuid()}; {HELP}"
     writable = found.st_mode & OTHERS
-    if writable & stat.S_IWGRP and _alone_in(found.st_gid):
+    if writable & stat.S_IWGRP and alone_in(found.st_gid):
         writable &= ~stat.S_IWGRP
     if not writable or (sticky and found.st_mode & stat.S_ISVTX):
         return ""
     return f"{path} may be written by others (mode {stat.S_IMODE(found.st_mode):o}): chmod go-w {path}, or {HELP}"
 
 
-def _alone_in(group: int) -> bool:
+def alone_in(group: int) -> bool:
     """True for a group of this user alone, as Debian makes one for each user, or that of root."""
     import grp
     import pwd

@@ -63,9 +63,9 @@ def test_a_link_is_not(library: Path) -> None:
 def test_the_group_of_the_user_alone_may_write(library: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """With umask 002, as Ubuntu and Fedora have it."""
     library.chmod(0o775)
-    monkeypatch.setattr("sim_server.backends.cache_trust._alone_in", lambda group: True)
+    monkeypatch.setattr("sim_server.backends.cache_trust.alone_in", lambda group: True)
     assert distrust(library) == ""
-    monkeypatch.setattr("sim_server.backends.cache_trust._alone_in", lambda group: False)
+    monkeypatch.setattr("sim_server.backends.cache_trust.alone_in", lambda group: False)
     assert "may be written by others (mode 775)" in distrust(library)
 
 
