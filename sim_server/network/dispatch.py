@@ -283,19 +283,14 @@ class Dispatch(FactorSource):
         return info is not None and info.builds
 
     def _choose(self, idle: list[str], object: str) -> str:
-        """Chooses the worker with the fewest expired jobs; then one with the fewest jobs in flight, the fastest, the
-        last of the object, the least used."""
+        """Chooses the worker with the fewest expired jobs; then the one that would be done first, the one with the
+        fewest jobs in flight, the last of the object, the least used."""
 
-        def rank(name: str) -> tuple[int, int, float, bool, int]:
-            info = self._registry.info(name)
+        def rank(name: str) -> tuple[int, float, int, bool, int]:
+            info, waiting = self._registry.info(name), self._leases.count(name)
             expired, expected = self._leases.expired_count(name), self._timing.expected(name, object)
-            return (
-                expired,
-                self._leases.count(name),
-                expected,
-                self._last_worker.get(object) != name,
-                info.jobs if info else 0,
-            )
+            other = self._last_worker.get(object) != name
+            return expired, (1 + waiting) * expected, waiting, other, info.jobs if info else 0
 
         return min(idle, key=rank)
 
