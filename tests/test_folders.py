@@ -20,7 +20,7 @@ ALLOWED = {  # what each folder imports of its package
     "precond_worker.symbolic": {"arrays"},
     "precond_worker.gpu": {"arrays", "errors", "symbolic"},
     "precond_worker.factorization": {"arrays", "errors", "gpu", "symbolic"},
-    "precond_worker.network": {"errors", "remote_assembly"},
+    "precond_worker.network": {"errors", "pool_choice", "remote_assembly"},
     "clients.accuracy": {"errors", "load_test", "log", "progress", "watch"},
     "clients.demo": {"client", "errors", "grab", "load_test", "log"},
     "clients.examples": {"client", "errors", "grab", "log"},
