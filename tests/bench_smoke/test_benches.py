@@ -13,8 +13,8 @@ BENCHES = {
     "accuracy": [], "contact": [], "cutting": [], "effects": [], "elements": [], "explicit": [],
     "factors": ["--library", "SciPy's SuperLU", "supernodal"], "hard_cases": [],
     "models": ["--devices", "cpu"],
-    "paper": ["--device", "cpu", "--only", *PAPER], "preconditioners": [], "rosenbrock": [], "scheduler": [],
-    "verification": [], "warp": [],
+    "paper": ["--device", "cpu", "--only", *PAPER], "preconditioners": [], "rosenbrock": [],
+    "scale": [], "scheduler": [], "verification": [], "warp": [],
 }  # fmt: skip
 
 

@@ -30,6 +30,7 @@ PAGES = (
     "web",
     "faults",
     "attacks",
+    "scale",
 )
 
 
