@@ -165,6 +165,9 @@ def _serve(
     try:
         own = [server.partition("@")[2] for server in servers if "@" in server]
         identity = usual_identity(tls, ("worker",), [*connect, *own] or given_endpoints())
+        if identity is not None and identity.role != "worker":
+            text = f"the certificate {identity.name!r} was made for a {identity.role}"
+            print(f"precond-worker: {text}: a server that has it as one gives it no jobs", file=sys.stderr, flush=True)
         if identity is not None and identity_in(name) != identity.name:
             name = own_name(identity.name, name[len(identity.name) - 63 :])  # its end tells workers apart
         check_name(name, "--name")

@@ -18,7 +18,9 @@ from pathlib import Path
 ROOT = Path(__file__).parents[1]
 PACKAGES = ("protocol", "sim_server", "precond_worker", "clients")
 NATIVE = (".cu", ".cuh", ".h", ".cpp")
-PRIVATE = re.compile(r"_(?!(fields|replace|asdict)$)[A-Za-z0-9]\w*(?<!_)")  # of Python, but for those of a named tuple
+PRIVATE = re.compile(
+    r"_(?!(fields|replace|asdict|exit)$)[A-Za-z0-9]\w*(?<!_)"
+)  # but for a named tuple and os._exit
 LISTED = 5  # of the largest files and functions
 Graph = dict[str, set[str]]
 

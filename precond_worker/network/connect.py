@@ -16,20 +16,20 @@ TIMEOUT = 1.0  # s of one attempt
 def connect_session(
     connect: Sequence[str], shared_memory: bool, ended: threading.Event | None = None, tls: Identity | None = None
 ) -> Session:
-    """Opens a session to the server; retries until it is there, and prints the first failure. Raises BadEndpoint.
+    """Opens a session to the server; retries until it is there, and prints each failure once. Raises BadEndpoint.
 
     ended: set to give up, which raises the last ConnectionFailed.
     """
-    reported = False
+    reported: set[str] = set()
     while True:
         try:
             return open_session("client", connect=connect, shared_memory=shared_memory, timeout=TIMEOUT, tls=tls)
         except ConnectionFailed as failure:
             if ended is not None and ended.wait(0.05):
                 raise
-            if not reported:
+            if str(failure) not in reported:  # it may be refused once it is there
                 print(f"precond-worker: {failure}; trying until the server is there", file=sys.stderr, flush=True)
-            reported = True
+            reported.add(str(failure))
 
 
 class Connector:

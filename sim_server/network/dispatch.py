@@ -64,9 +64,9 @@ class Dispatch(FactorSource):
     ):
         self._session, self._server, self._incarnation = session, server, incarnation
         self._pool, self._queue, self._counters, self._clock = pool, queue, counters, clock
-        self._decoder = FactorDecoder(incarnation)
+        self.decoder = FactorDecoder(incarnation)
         self._registry = WorkerRegistry(incarnation, silence)
-        self._leases = Leases(pool)
+        self.leases = Leases(pool)
         self._timing = WorkerTiming()
         self._reliability = WorkerReliability()
         self._lock = threading.RLock()  # a status lists the workers while the loop thread takes in a factor
@@ -93,17 +93,17 @@ class Dispatch(FactorSource):
     def announce(self, topology: Topology) -> None:
         """Begins a new epoch of an object; answers to jobs of the last one are refused."""
         with self._lock:
-            if (job := self._leases.by_object.get(topology.header.object)) is not None:
+            if (job := self.leases.by_object.get(topology.header.object)) is not None:
                 self._fail(job, "was of a mesh that was split since")
-            self._decoder.announce(topology)
-            self._leases.forget_object(topology.header.object)
+            self.decoder.announce(topology)
+            self.leases.forget_object(topology.header.object)
             self._timing.forget_object(topology.header.object)
             self._reliability.forget_object(topology.header.object)
 
     def epoch(self, name: str) -> int | None:
         """Returns the epoch of an object that was announced last; jobs of others are refused."""
         with self._lock:
-            known = self._decoder.objects.get(name)
+            known = self.decoder.objects.get(name)
             return None if known is None else known.epoch
 
     def workers(self) -> list[WorkerInfo]:
@@ -158,13 +158,13 @@ class Dispatch(FactorSource):
         with self._lock:
             now = self._clock()
             idle = [(name, now - self._free_since.get(name, 0.0)) for name in self._open()]
-            busy = [(j.worker, j.object, now - j.sent_at) for j in self._leases.jobs if not self._room(j.worker)]
+            busy = [(j.worker, j.object, now - j.sent_at) for j in self.leases.jobs if not self._room(j.worker)]
             return self._timing.faster_busy_workers(idle, busy)
 
     def reassigned(self) -> list[str]:
         """Objects whose job was taken from a slow worker since another one is idle; they may be submitted again."""
         with self._lock:
-            slow = self._leases.reassign(self._clock(), self._has_candidates)
+            slow = self.leases.reassign(self._clock(), self._has_candidates)
             self._counters.add("passed_on", len(slow))
             return [job.object for job in slow]
 
@@ -202,7 +202,7 @@ class Dispatch(FactorSource):
             return self._submit(job)
 
     def _submit(self, job: Job) -> bool:
-        known = self._decoder.objects.get(job.object)
+        known = self.decoder.objects.get(job.object)
         if known is None or known.epoch != job.epoch:
             raise ValueError(f"job for {job.object} epoch {job.epoch}, which was not announced")
         shape = (known.size // 3, 3) if job.positions else (known.blocks, 3, 3)
@@ -211,14 +211,14 @@ class Dispatch(FactorSource):
         self._receive()
         idle = [name for name in self._open() if not job.positions or self._assembles(name)]
         idle = self._candidates(idle, self._available(), job.object)
-        if job.object in self._leases.by_object or not idle:
+        if job.object in self.leases.by_object or not idle:
             return False
         worker = self._choose(idle, job.object)
         matrix_slot, factor_slot = self._allocate_slots(worker, job)
-        lease = self._leases.lease(job.object, worker, job.method.name, job.positions)
+        lease = self.leases.lease(job.object, worker, job.method.name, job.positions)
         now = self._clock()
         in_flight = InFlightJob(
-            self._leases.next_number(),
+            self.leases.next_number(),
             job.object,
             job.epoch,
             job.step,
@@ -230,23 +230,23 @@ class Dispatch(FactorSource):
             factor_generation=factor_slot.generation if factor_slot else 0,
             slots=tuple(slot for slot in (matrix_slot, factor_slot) if slot is not None),
             sent_at=now,
-            exclusive_until=now + self._leases.exclusive_period(job.object, known.blocks),
+            exclusive_until=now + self.leases.exclusive_period(job.object, known.blocks),
             method=job.method.name,
             payload_bytes=0 if matrix_slot else job.values.nbytes,
             positions=job.positions,
         )
-        self._leases.start(in_flight)
+        self.leases.start(in_flight)
         if self._post(in_flight, job, lease, matrix_slot):
             self._last_worker[job.object] = worker
             self._reliability.on_sent(worker, now)
             self._counters.add("jobs")
             self._counters.add("bytes_out", job.values.nbytes)
             return True
-        self._leases.cancel(in_flight)
+        self.leases.cancel(in_flight)
         return False
 
     def _available(self) -> list[str]:
-        return self._registry.available(self._clock(), self._leases.deadlines())
+        return self._registry.available(self._clock(), self.leases.deadlines())
 
     def _open(self) -> list[str]:
         """Available workers with room for a job."""
@@ -262,10 +262,10 @@ class Dispatch(FactorSource):
         """
         info, seconds = self._registry.info(worker), self._timing.mean_factorization(worker)
         most = 1
-        small = self._decoder.most_blocks <= SMALL_BLOCKS and self._pool is not None
+        small = self.decoder.most_blocks <= SMALL_BLOCKS and self._pool is not None
         if info is not None and info.shared_memory and seconds is not None and small:
             most = max(1, min(info.most_jobs, MOST_JOBS, int(QUEUE_SECONDS / max(seconds, 1e-6))))
-        return max(0, most - self._leases.count(worker))
+        return max(0, most - self.leases.count(worker))
 
     def _candidates(self, idle: list[str], available: list[str], object: str) -> list[str]:
         """Idle workers that are not suspended for the object; all idle ones if all available workers are."""
@@ -283,29 +283,24 @@ class Dispatch(FactorSource):
         return info is not None and info.builds
 
     def _choose(self, idle: list[str], object: str) -> str:
-        """Chooses the worker with the fewest expired jobs; then one with the fewest jobs in flight, the fastest, the
-        last of the object, the least used."""
+        """Chooses the worker with the fewest expired jobs; then the one that would be done first, the one with the
+        fewest jobs in flight, the last of the object, the least used."""
 
-        def rank(name: str) -> tuple[int, int, float, bool, int]:
-            info = self._registry.info(name)
-            expired, expected = self._leases.expired_count(name), self._timing.expected(name, object)
-            return (
-                expired,
-                self._leases.count(name),
-                expected,
-                self._last_worker.get(object) != name,
-                info.jobs if info else 0,
-            )
+        def rank(name: str) -> tuple[int, float, int, bool, int]:
+            info, waiting = self._registry.info(name), self.leases.count(name)
+            expired, expected = self.leases.expired_count(name), self._timing.expected(name, object)
+            other = self._last_worker.get(object) != name
+            return expired, (1 + waiting) * expected, waiting, other, info.jobs if info else 0
 
         return min(idle, key=rank)
 
     def _allocate_slots(self, worker: str, job: Job) -> tuple[Slot | None, Slot | None]:
         """Allocates slots for the matrix and its factor; None for an array that must travel as bytes."""
         info = self._registry.info(worker)
-        unfit = info is None or not info.shared_memory or self._leases.expired_count(worker) >= MAX_EXPIRED
+        unfit = info is None or not info.shared_memory or self.leases.expired_count(worker) >= MAX_EXPIRED
         if self._pool is None or unfit:
             return None, None
-        nonzeros = self._decoder.objects[job.object].largest.get(job.method.name, 0)
+        nonzeros = self.decoder.objects[job.object].largest.get(job.method.name, 0)
         if job.method.name == "incomplete_cholesky":
             nonzeros += nonzeros // SLOT_MARGIN  # the next factor may keep more blocks
         matrix = self._pool.lend(job.values.nbytes)
@@ -315,7 +310,7 @@ class Dispatch(FactorSource):
         return matrix, factor
 
     def _post(self, in_flight: InFlightJob, job: Job, lease: float, slot: Slot | None) -> bool:
-        known = self._decoder.objects[job.object]
+        known = self.decoder.objects[job.object]
         message = matrix_message(in_flight, known, self._incarnation, lease, job.method)
         payload = add_values(message, job.values, slot)
         name = key("matrix", self._server, worker=in_flight.worker, object=in_flight.object)
@@ -356,12 +351,12 @@ class Dispatch(FactorSource):
             return  # many jobs are submitted one after another
         self._looked_at = now
         if len(self._sent) > MAX_SENT:
-            flying = {job.number for job in self._leases.jobs}
+            flying = {job.number for job in self.leases.jobs}
             self._sent = {number: when for number, when in self._sent.items() if number in flying}
-        for job in self._leases.expire(now):
+        for job in self.leases.expire(now):
             self._counters.add("leases_over")
             self._on_expired(job, "was not answered within its lease")
-        for job in self._leases.expire_undelivered(self._sent_at, self._registry.idle_period):
+        for job in self.leases.expire_undelivered(self._sent_at, self._registry.idle_period):
             self._counters.add("jobs_lost")
             self._on_expired(job, f"was lost: worker {job.worker} says that it has no job")
 
@@ -388,7 +383,7 @@ class Dispatch(FactorSource):
 
     def _on_heartbeat(self, sample: zenoh.Sample) -> None:
         data = take(sample.payload, CHANNELS["worker"].limit, "WorkerInfo")
-        name, new, removed = self._registry.heartbeat(sample.key_expr, data, self._clock(), self._leases.deadlines())
+        name, new, removed = self._registry.heartbeat(sample.key_expr, data, self._clock(), self.leases.deadlines())
         if removed:
             self._remove_worker(removed)
         if new:
@@ -399,7 +394,7 @@ class Dispatch(FactorSource):
                 self._counters.warn("worker_copies", f"worker {name} has no shared memory with us, arrays are copied")
 
     def _remove_worker(self, name: str) -> None:
-        lost = self._leases.remove_worker(name)
+        lost = self.leases.remove_worker(name)
         self._timing.forget_worker(name)
         self._reliability.forget_worker(name)
         self._fast_links.discard(name)
@@ -410,19 +405,19 @@ class Dispatch(FactorSource):
             self._fail(job, f"was lost with worker {name}")
 
     def _on_pattern(self, sample: zenoh.Sample) -> None:
-        if (new := self._decoder.add_pattern(sample.key_expr, sample.payload)) is not None:
+        if (new := self.decoder.add_pattern(sample.key_expr, sample.payload)) is not None:
             self._patterns = [*self._patterns, new][-MAX_NEW_PATTERNS:]
 
     def _on_factor(self, sample: zenoh.Sample) -> None:
-        message = self._decoder.parse_factor(sample.key_expr, sample.attachment)
-        job = self._leases.match_answer(message.job, message.worker, message.header.epoch)
+        message = self.decoder.parse_factor(sample.key_expr, sample.attachment)
+        job = self.leases.match_answer(message.job, message.worker, message.header.epoch)
         now = self._clock()
         self._registry.mark_seen(job.worker, now)
         self._free_since[job.worker] = now
         self._reliability.on_answer(job.worker)
-        if self._leases.is_reassigned(job):
-            return self._leases.finish(job, None if message.failure else message.seconds)
-        decode = partial(self._decoder.decode, message, sample.payload, job)
+        if self.leases.is_reassigned(job):
+            return self.leases.finish(job, None if message.failure else message.seconds)
+        decode = partial(self.decoder.decode, message, sample.payload, job)
         if not message.failure and 4 * message.nonzeros > LARGE:  # its bytes are copied and checked beside the caller
             if self._is_decoded(job):
                 raise Refused(f"Factor.job is {job.number}, already answered", "duplicate")
@@ -441,9 +436,9 @@ class Dispatch(FactorSource):
             self._decoding.remove(each)
             message, job, factor = each
             try:
-                current = self._leases.match_answer(job.number, job.worker, job.epoch)
-                if self._leases.is_reassigned(current):
-                    self._leases.finish(current, message.seconds)
+                current = self.leases.match_answer(job.number, job.worker, job.epoch)
+                if self.leases.is_reassigned(current):
+                    self.leases.finish(current, message.seconds)
                 else:
                     self._take_factor(message, current, factor.result)
             except Refused as refusal:
@@ -465,7 +460,7 @@ class Dispatch(FactorSource):
             self._fail(job, f"was refused: {refusal}")
             raise
         finally:
-            self._leases.finish(job, seconds)
+            self.leases.finish(job, seconds)
         self._counters.add("factors")
         self._counters.add("bytes_in", self._factors[-1].values.nbytes)
         capacity = job.factor_slot.capacity if job.factor_slot is not None else 0

@@ -35,7 +35,7 @@ class Blades:
         self._fine = FINE * min(lengths, default=0.0)
         self._cut: dict[int, Float64] = {}  # where an edge was when it cut last, (2, 3) [m]
         self._seen: dict[int, Float64] = {}  # where it was at the last look
-        self._due, self._step = 0.0, -1
+        self.due, self._step = 0.0, -1
 
     def restart(self) -> None:
         """Begins anew where obstacles are, which a reset has put there."""
@@ -46,7 +46,7 @@ class Blades:
     def look(self) -> None:
         """Cuts what has been swept, if there is something to look at and it is due."""
         step = self._simulation.engine.step
-        if not self._bodies or step == self._step or time.monotonic() < self._due:
+        if not self._bodies or step == self._step or time.monotonic() < self.due:
             return
         begin = time.monotonic()
         poses = self._poses()
@@ -62,7 +62,7 @@ class Blades:
                 self._cut[k] = now
                 self._sweep(self._names[k], before, now)
         end = time.monotonic()
-        self._due = end + max(PERIOD, end - begin)  # half of the time is for all else
+        self.due = end + max(PERIOD, end - begin)  # half of the time is for all else
 
     def _poses(self) -> Float64 | None:
         """Returns the poses of all obstacles (m, 7); None while the loop is writing them."""

@@ -86,7 +86,7 @@ class Driver:
         self.snapshots = SnapshotPool(simulation, self.source, self.policy.expected_latency)
         self.useless_factors = UselessFactors(self)
         self._checker = ThreadPoolExecutor(1, "checks of factors")
-        self._checks: list[FactorUnderCheck] = []  # oldest first
+        self.checks: list[FactorUnderCheck] = []  # oldest first
         self._observer = SolveObserver(self)
         self._warped = {b.name: b.index in simulation.warped for b in world.bodies}
 
@@ -211,7 +211,7 @@ class Driver:
         if is_new and beside and factor.values.nbytes > LARGE:
             memory, matrix = self.snapshots.hold(state, factor.step)
             reason = self._checker.submit(self.check.reject_reason, factor, matrix)
-            self._checks.append(FactorUnderCheck(factor, memory, reason))
+            self.checks.append(FactorUnderCheck(factor, memory, reason))
             return
         self.policy.on_job_end()
         matrix = self.snapshots.release(state, factor.step)
@@ -219,9 +219,9 @@ class Driver:
 
     def _end_checks(self) -> None:
         """Takes up the factors whose checks have ended."""
-        ended = [each for each in self._checks if each.reason.done()]
+        ended = [each for each in self.checks if each.reason.done()]
         for check in ended:
-            self._checks.remove(check)
+            self.checks.remove(check)
             factor, state = check.factor, self.by_name[check.factor.object]
             if check.memory is not None:
                 self.snapshots.recycle(check.memory)

@@ -31,7 +31,7 @@ class SnapshotPool:
         self._simulation, self._source, self._expected_latency = simulation, source, expected_latency
         self._solver = simulation.scene.solver
         self._requests = count()
-        self._free: dict[tuple[int, ...], list[NDArray[np.float64]]] = {}  # by shape; pages touched before
+        self.free: dict[tuple[int, ...], list[NDArray[np.float64]]] = {}  # by shape; pages touched before
 
     def request(self, state: BodyUpdateState) -> None:
         """Asks the loop to copy when it assembles next: the matrix, or the positions if they suffice."""
@@ -91,13 +91,13 @@ class SnapshotPool:
         return values, values if copied == step and values.ndim == 3 else None
 
     def _allocate(self, shape: tuple[int, ...]) -> NDArray[np.float64]:
-        free = self._free.setdefault(shape, [])
+        free = self.free.setdefault(shape, [])
         return free.pop() if free else np.full(shape, 0.0)
 
     def recycle(self, copy: NDArray[np.float64]) -> None:
         """Has the memory of a copy used again."""
         if copy.base is None:  # not a view of the system's own values
-            self._free.setdefault(copy.shape, []).append(copy)
+            self.free.setdefault(copy.shape, []).append(copy)
 
     def _workers_assemble(self, state: BodyUpdateState) -> bool:
         """True if workers can assemble the matrix from positions: all effects are known to them, there is no contact,

@@ -166,6 +166,7 @@ class SolverHost(Host):
     def __init__(self) -> None:
         super().__init__()
         self.cp.ones = lambda shape, dtype=float: as_device(np.ones(shape, dtype))
+        self.cp.cuda = SimpleNamespace(Device=lambda: SimpleNamespace(use=lambda: None))
         self.properties = {"multiProcessorCount": 132, "sharedMemPerMultiprocessor": 1 << 17}
 
 

@@ -12,7 +12,7 @@ from tests.hard_cases.of_effects import EffectCase, run_effect_case, tells
 from tests.hard_cases.recipe_table import RECIPES
 
 LONG = ("heavy on soft", "wedge", "fast and small on thin", "prony", "damage", "cable", "growth", "a holder that jumps")
-RECIPE_NAMES = {case.name for case in RECIPES}  # test_recipes.py
+RECIPE_NAMES = {case.name for case in RECIPES}  # tests/bench_smoke/test_hard_cases_recipes.py
 SHORT = [case for case in EFFECT_CASES if not case.name.startswith(LONG) and case.name not in RECIPE_NAMES]
 
 

@@ -181,6 +181,7 @@ def test_who_has_no_certificate_of_a_worker_is_none(stage: TlsStage) -> None:
         now = bob.status(fresh=True).step
         until(lambda: bob.status(fresh=True).step > now + 20, "steps")
         assert [w.worker for w in bob.status().workers] == ["worker.local-1"]
+    until(lambda: "'viewer' was made for a viewer: a server that has it as one" in wrong.output(), "it says so")
     assert (plain.end(), wrong.end()) == (0, 0)
 
 

@@ -137,11 +137,11 @@ def test_a_faster_worker_gets_the_object_when_both_are_idle() -> None:
             assert step < 100
             for object, nodes in (("a", 5), ("b", 6)) if step % 2 else (("b", 6), ("a", 5)):
                 sim.submit(chain(nodes, object), step)
-        sim.until(lambda: sim.link.dispatch.ready() == 2, "both to be idle")
+        sim.until(lambda: not sim.link.dispatch.leases.jobs, "both to be idle")
         sim.factors.clear()
         for k in range(5):
             assert sim.factor(chain(5, "a"), 1000 + k).worker == "fast"
-            sim.until(lambda: sim.link.dispatch.ready() == 2, "both to be idle")
+            sim.until(lambda: not sim.link.dispatch.leases.jobs, "both to be idle")
 
 
 def test_workers_go_where_they_are_needed_most_and_lose_no_job() -> None:

@@ -92,13 +92,13 @@ def test_large_factors_are_decoded_beside_the_caller(monkeypatch: pytest.MonkeyP
         driver.until(link.dispatch.ready, "the worker")
         driver.submit(BEAM, 1)
         answer, values = hand.right_answer(hand.receive(), BEAM)
-        decoding, decode = threading.Event(), link.dispatch._decoder.decode
+        decoding, decode = threading.Event(), link.dispatch.decoder.decode
 
         def slow(*arguments: Any) -> Any:
             assert decoding.wait(30)
             return decode(*arguments)
 
-        monkeypatch.setattr(link.dispatch._decoder, "decode", slow)
+        monkeypatch.setattr(link.dispatch.decoder, "decode", slow)
         hand.answer(answer, values)
         hand.answer(answer, values)
         driver.until(lambda: link.counters.refusals["duplicate"] == 1, "the second answer")

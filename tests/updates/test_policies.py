@@ -451,19 +451,19 @@ def test_large_factors_are_checked_beside_the_steps(sent):
     memory = driver.bodies[0].job.matrix[1]
     driver.adopt(factor)
     assert driver.advance(2)["factor_step"].tolist() == [-1, -1]
-    assert all(memory is not free for kept in driver.snapshots._free.values() for free in kept), "it is being read"
+    assert all(memory is not free for kept in driver.snapshots.free.values() for free in kept), "it is being read"
     go.set()
-    wait([each.reason for each in driver._checks])
+    wait([each.reason for each in driver.checks])
     assert driver.advance(1)["factor_step"].tolist() == [factor.step]
-    assert any(memory is free for kept in driver.snapshots._free.values() for free in kept)
-    assert driver.bodies[0].factors.used == 1 and driver._checks == []
+    assert any(memory is free for kept in driver.snapshots.free.values() for free in kept)
+    assert driver.bodies[0].factors.used == 1 and driver.checks == []
 
 
 def test_a_large_factor_that_is_no_use_is_refused_beside_the_steps(sent):
     driver, factor, go = sent
     driver.adopt(replace(factor, values=np.full_like(factor.values, np.nan)))
     go.set()
-    wait([each.reason for each in driver._checks])
+    wait([each.reason for each in driver.checks])
     assert driver.advance(2)["factor_step"].tolist() == [-1, -1]
     assert driver.bodies[0].failures.refused == 1 and not driver.bodies[0].job.in_flight
 

@@ -212,13 +212,13 @@ class GpuEngine(DeviceLoop):
         self._changes, self._work_graphs = ChangeMailbox(self.loop), list[Graph]()
         self._graphs: list[Graph | None] = []
         self._epilogue = self._epilogue_params(dt)
-        self._integrate, self._stages = None, None
+        self._integrate, self.stages = None, None
         if stages and given.euler and stage_results is not None:
-            self._stages = RosenbrockStep(
+            self.stages = RosenbrockStep(
                 gpu, device, stages, given.euler, assemble, self.solver, self._epilogue, stage_results, given.energies,
                 gpu.twin(arrays["b"]), given.cut,
             )  # fmt: skip
-            self._stamp_begin = self._stages.stamp_begin
+            self._stamp_begin = self.stages.stamp_begin
         else:
             epilogue = Epilogue(EPILOGUE.checked(), "StepEpilogue", "finish_step", self._epilogue)
             ending = self._newton.ending() if self._newton else None
@@ -278,7 +278,7 @@ class GpuEngine(DeviceLoop):
 
     def state(self) -> list[StateArray]:
         """Returns what the device carries on beside the arrays that launches write."""
-        parts = (self._energies, self._stages, self._substeps, self._contact, self._correction, self._splits)
+        parts = (self._energies, self.stages, self._substeps, self._contact, self._correction, self._splits)
         clock = self.gpu.twin(self._arrays["clock"])
         found = [device_array("engine.clock", clock), *(a for part in parts if part for a in part.state())]
         if self._rows_of_bodies:
@@ -328,7 +328,7 @@ class GpuEngine(DeviceLoop):
         self.use_graphs(handles, *(int(graph.graphExec) for graph in others))
         self._graphs += others  # kept as long as the engine
         self._second_half = None
-        if self._stages or self._contact or self._substeps or (self._newton and self._newton.loops):
+        if self.stages or self._contact or self._substeps or (self._newton and self._newton.loops):
             self._second_half = self._captured(self._finish_step)
 
     def _report_grabs(self, device: CudaDevice, touch: DeviceLaunch) -> None:
@@ -398,8 +398,8 @@ class GpuEngine(DeviceLoop):
 
     def _finish_step(self) -> None:
         """Appends solve, integration and epilogue."""
-        if self._stages:
-            self._stages.launch()
+        if self.stages:
+            self.stages.launch()
         else:
             (self._newton or self._contact or self._substeps or self.solver).launch()
             if self._held:

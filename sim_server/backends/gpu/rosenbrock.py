@@ -155,7 +155,7 @@ class RosenbrockStep:
         params["attempt"], params["nodes"] = attempt, self._nodes
         return params
 
-    def _solve(self, form: int, first_of_step: bool = False, first_of_attempt: bool = False) -> NDArray[Any]:
+    def solve_arguments(self, form: int, first_of_step: bool = False, first_of_attempt: bool = False) -> NDArray[Any]:
         """Returns the arguments of a solve."""
         stage = np.zeros((), STAGE_SOLVE)
         for name, array in self._solve_memory.items():
@@ -167,9 +167,9 @@ class RosenbrockStep:
     def launch(self) -> None:
         """Appends the step after the assembly of its first stage, while a graph is captured."""
         if self.alone:
-            self._solver.apply_factors(0, self._solve(FACTOR, first_of_step=True, first_of_attempt=True))
+            self._solver.apply_factors(0, self.solve_arguments(FACTOR, first_of_step=True, first_of_attempt=True))
             _launch(self._second, *self._again)
-            self._solver.apply_factors(1, self._solve(FACTOR))
+            self._solver.apply_factors(1, self.solve_arguments(FACTOR))
             self._first_finish()
             with self._device.branch(self._left):
                 _launch(self._restore, *self._assemble)
@@ -183,15 +183,15 @@ class RosenbrockStep:
         self, first_of_step: bool, second: Launch | FusedKernel, again: Sequence[Launchable], finish: FusedKernel
     ) -> None:
         """Appends an attempt by iterations, and the branch of backward Euler."""
-        self._solver.iterate(2, self._solve(ITERATE, first_of_step, first_of_attempt=True))
+        self._solver.iterate(2, self.solve_arguments(ITERATE, first_of_step, first_of_attempt=True))
         _launch(second, *again)
-        self._solver.iterate(3, self._solve(ITERATE))
+        self._solver.iterate(3, self.solve_arguments(ITERATE))
         finish()
         with self._device.branch(self._left):
             self._back()
             self._set_coefficients(self._euler_pair)
             _launch(*self._euler)
-            self._solver.iterate(4, self._solve(EULER, first_of_attempt=True))
+            self._solver.iterate(4, self.solve_arguments(EULER, first_of_attempt=True))
             self._set_coefficients(self._own_pair)
             self._advance()
 
