@@ -72,11 +72,12 @@ def simulated(base: Plan, racked: dict[str, Any], quick: bool) -> tuple[list[dic
     plans = [(f"{base.pools} pools", replace(base, policy=policy)) for policy in POLICIES]
     plans += [
         ("one pool", replace(base, pools=1)),
-        ("half as many workers, pools twice as large", replace(base, workers=base.workers // 2, pools=max(base.pools // 2, 1))),
+        ("half as many workers, pools twice as large",
+         replace(base, workers=base.workers // 2, pools=max(base.pools // 2, 1))),
         ("twice as many workers", replace(base, workers=2 * base.workers)),
         ("links ten times as fast", replace(base, link=10 * LINK)),
         ("five times as many hands", replace(base, touched=5 * base.touched)),
-    ]
+    ]  # fmt: skip
     rows, racks = [], []
     for what, plan in plans[: len(POLICIES) + 1] if quick else plans:
         rows.append(figures(Run(plan).run(), what))
