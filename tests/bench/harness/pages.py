@@ -31,6 +31,7 @@ PAGES = (
     "faults",
     "attacks",
     "scale",
+    "fuzz",
 )
 
 
