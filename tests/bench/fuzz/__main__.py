@@ -25,6 +25,7 @@ from tests.fuzz.found import keep
 
 TITLE = "Hostile inputs"
 BATCH = {"scene": 200, "mesh": 400, "log": 400, "wire": 2000}
+LONGEST = 120.0  # s of a batch, in which SIGALRM may wait for native code
 COLUMNS = ("kind", "inputs", "accepted", "refused", "findings", "seconds", "inputs/s", "longest ms")
 WORDS = """*scene*: a scene of deploy/scenes with one to three values, keys or tables changed, at times bytes, too;
 read as by `sim-server`. *mesh*: a box in six formats, text and binary, bytes changed or numbers replaced;
@@ -67,7 +68,7 @@ def tried(kind: str, first: int, count: int) -> dict[str, Any]:
     process.start()
     there.close()
     try:
-        accepted, refused, found, longest = here.recv() if here.poll(600) else _ended(process, "hangs", seed.value)
+        accepted, refused, found, longest = here.recv() if here.poll(LONGEST) else _ended(process, "hangs", seed.value)
     except EOFError:
         process.join()
         accepted, refused, found, longest = _ended(process, _why(process.exitcode), seed.value)

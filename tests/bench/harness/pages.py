@@ -32,6 +32,7 @@ PAGES = (
     "attacks",
     "scale",
     "fuzz",
+    "soak",
 )
 
 
