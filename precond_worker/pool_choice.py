@@ -105,8 +105,9 @@ class PoolChoice:
         count = self._count(servers)
         worth = {name: self._worth(servers, name, 1 / count) for name in servers}
         others = [name for name in servers if name not in self.seats and self._demands[name] > LEAST]
-        best = max(others, key=worth.__getitem__, default="")
-        worst = min(self.seats, key=worth.__getitem__, default="")
+        order = {name: (worth[name], self._demands[name]) for name in servers}  # among those without a worker, too
+        best = max(others, key=order.__getitem__, default="")
+        worst = min(self.seats, key=order.__getitem__, default="")
         if len(self.seats) > count:
             return (worst, "") if worth[worst] < inf else None
         if len(self.seats) < count:

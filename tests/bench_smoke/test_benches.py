@@ -11,10 +11,10 @@ from tests.bench_smoke.quickly import ROOT, writes_its_report
 PAPER = ("table1", "table2 bend, springs", "table5", "policies", "extrapolations", "automatic", "figure4", "publishing")
 BENCHES = {
     "accuracy": [], "contact": [], "cutting": [], "effects": [], "elements": [], "explicit": [],
-    "factors": ["--library", "SciPy's SuperLU", "supernodal"], "hard_cases": [],
+    "fuzz": [], "factors": ["--library", "SciPy's SuperLU", "supernodal"], "hard_cases": [],
     "models": ["--devices", "cpu"],
-    "paper": ["--device", "cpu", "--only", *PAPER], "preconditioners": [], "rosenbrock": [], "scheduler": [],
-    "verification": [], "warp": [],
+    "paper": ["--device", "cpu", "--only", *PAPER], "preconditioners": [], "rosenbrock": [],
+    "scale": [], "scheduler": [], "verification": [], "warp": [],
 }  # fmt: skip
 
 

@@ -45,19 +45,19 @@ def free_endpoint(host: str = "127.0.0.1") -> str:
 class Stage:
     """One server in real time that swings a beam until it is told to stop; all processes end with it.
 
-    host: where it listens; far: words before a worker's command line, such as those that put it elsewhere; device: of
-    the server.
+    scene: with an object "beam"; host: where it listens; far: words before a worker's command line, such as
+    those that put it elsewhere; device: of the server.
     """
 
-    def __init__(self, host: str = "127.0.0.1", far: Sequence[str] = (), device: str = "cpu"):
+    def __init__(self, host: str = "127.0.0.1", far: Sequence[str] = (), device: str = "cpu", scene: str = SCENE):
         self.endpoint = free_endpoint(host)
         self._far = list(far)
         self._folder = tempfile.TemporaryDirectory(prefix="warpfactor-faults-")
         self.log = Path(self._folder.name) / "run.mcap"
-        scene = Path(self._folder.name) / "beam.toml"
-        scene.write_text(SCENE)
+        file = Path(self._folder.name) / "beam.toml"
+        file.write_text(scene)
         self._processes: list[subprocess.Popen[bytes]] = []
-        words = [str(scene), "--listen", self.endpoint, "--record", str(self.log), "--quiet", "--device", device]
+        words = [str(file), "--listen", self.endpoint, "--record", str(self.log), "--quiet", "--device", device]
         words += [] if host == "127.0.0.1" else ["--insecure"]
         self.server = self.start(tool("sim_server", *words))
 

@@ -135,3 +135,16 @@ def test_where_nobody_needs_anything_a_worker_stays() -> None:
 def test_no_server_no_seat() -> None:
     choice = PoolChoice(0)
     assert choice.update({}, 0.0) == () and choice.changes == 0
+
+
+def test_of_servers_without_a_worker_the_one_that_loses_most_comes_first() -> None:
+    servers = {f"s{k}": ServerNeed(0.01, 0.0) for k in range(20)} | {"most": ServerNeed(0.5, 0.0)}
+    for seed in range(10):
+        choice = PoolChoice(seed)
+        (first,) = choice.update({"s0": ServerNeed(0.01, 1.0)}, 0.0)
+        assert first == "s0"
+        k = 0
+        while len(seats := choice.update({**servers, "s0": ServerNeed(0.01, 1.0)}, 0.5 * k)) == 1:
+            k += 1
+            assert k < 200
+        assert set(seats) == {"s0", "most"}

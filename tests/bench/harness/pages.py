@@ -30,6 +30,9 @@ PAGES = (
     "web",
     "faults",
     "attacks",
+    "scale",
+    "fuzz",
+    "soak",
 )
 
 
