@@ -155,7 +155,7 @@ def test_a_removed_file_is_told_and_a_new_one_begun(tmp_path: Path) -> None:
 FULL = """
 import sys, time
 from pathlib import Path
-from tests.log.test_pieces import begin, on_disk, steps, until
+from tests.log.test_log_pieces import begin, on_disk, steps, until
 from sim_server.recording.recorder import Recorder
 folder = Path(sys.argv[1])
 ballast = folder / "ballast"
@@ -211,7 +211,7 @@ def test_a_limit_of_file_size_is_no_end(tmp_path: Path) -> None:
     """RLIMIT_FSIZE, as `ulimit -f` sets: the log goes on in a new file."""
     code = (
         "import resource, signal, sys; from pathlib import Path\n"
-        "from tests.log.test_pieces import begin, steps, until\n"
+        "from tests.log.test_log_pieces import begin, steps, until\n"
         "from sim_server.recording.recorder import Recorder\n"
         "signal.signal(signal.SIGXFSZ, signal.SIG_IGN)\n"
         "resource.setrlimit(resource.RLIMIT_FSIZE, (3_000_000, resource.RLIM_INFINITY))\n"
