@@ -18,9 +18,7 @@ from pathlib import Path
 ROOT = Path(__file__).parents[1]
 PACKAGES = ("protocol", "sim_server", "precond_worker", "clients")
 NATIVE = (".cu", ".cuh", ".h", ".cpp")
-PRIVATE = re.compile(
-    r"_(?!(fields|replace|asdict|exit)$)[A-Za-z0-9]\w*(?<!_)"
-)  # but for a named tuple and os._exit
+PRIVATE = re.compile(r"_(?!(fields|replace|asdict|exit)$)[A-Za-z0-9]\w*(?<!_)")  # but for a named tuple and os._exit
 LISTED = 5  # of the largest files and functions
 Graph = dict[str, set[str]]
 

@@ -22,7 +22,8 @@ from sim_server.errors import InputError
 from sim_server.mesh.cells import tetrahedra
 from sim_server.mesh.check import complaints, crowded_faces, indices
 from sim_server.mesh.check_quadratic import quadratic_complaints, wound
-from sim_server.mesh.groups import Group, entities_without_group, listed, read_groups, unknown
+from sim_server.mesh.gmsh_files import gmsh_files
+from sim_server.mesh.groups import Group, listed, read_groups, unknown
 from sim_server.mesh.quadratic import quadratic_cells_of, sub_tetrahedra, with_mid_nodes
 from sim_server.mesh.surface import volumes
 
@@ -185,7 +186,7 @@ def meshio_read(path: Path, what: str = "mesh") -> Any:
     said = io.StringIO()  # meshio prints its reasons, and ends the process where it cannot read a file
     try:
         quiet = contextlib.redirect_stdout(said), contextlib.redirect_stderr(said)
-        with quiet[0], quiet[1], np.errstate(all="ignore"), entities_without_group():
+        with quiet[0], quiet[1], np.errstate(all="ignore"), gmsh_files():
             return meshio.read(path)
     except ImportError as error:
         raise InputError(f"{what} {path}: reading it needs the Python package {error.name!r}") from error

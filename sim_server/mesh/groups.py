@@ -5,8 +5,7 @@ A group of volume cells has elements, and their nodes; one of faces, edges or po
 several of these has all of them. Cells that have a number and no name are the group of that number, as "3".
 """
 
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -147,32 +146,3 @@ def _group(blocks: Sequence[Any], members: _Members, numbers: Int64, eightfold: 
     corners = corners[(corners >= 0).all(axis=1)]
     others = np.setdiff1d(others[others >= 0], corners)
     return Group(elements.astype(np.int32), corners.astype(np.int32), others.astype(np.int32))
-
-
-@contextmanager
-def entities_without_group() -> Iterator[None]:
-    """While it is entered, meshio reads files of gmsh 4 in which only some entities have a physical group ("save all").
-
-    meshio (5.3) leaves those without one out of a list that must have all, and then refuses the file; here they have
-    the group 0, which is none.
-    """
-    from meshio.gmsh import _gmsh40, _gmsh41
-
-    def with_groups(read: Any) -> Any:
-        def entities(*arguments: Any) -> Any:
-            found = read(*arguments)
-            for tags in found[0] if len(found) == 2 else found:
-                tags.update({entity: groups if len(groups) else [0] for entity, groups in tags.items()})
-            return found
-
-        return entities
-
-    modules = [m for m in (_gmsh40, _gmsh41) if hasattr(m, "_read_entities")]
-    given = [m._read_entities for m in modules]
-    try:
-        for module in modules:
-            module._read_entities = with_groups(module._read_entities)
-        yield
-    finally:
-        for module, read in zip(modules, given, strict=True):
-            module._read_entities = read

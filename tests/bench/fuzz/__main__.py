@@ -51,7 +51,7 @@ def batch(kind: str, first: int, count: int, seeds: Any, result: "Connection") -
             seeds.value, start = seed, time.perf_counter()
             try:
                 outcomes[targets.accepted(kind, inputs.made(kind, seed), Path(folder))] += 1
-            except Exception:
+            except (Exception, targets.TooLong):
                 found.append((seed, traceback.format_exc(limit=-3)))
             longest = max(longest, time.perf_counter() - start)
     result.send((outcomes[True], outcomes[False], found, longest))
