@@ -293,3 +293,16 @@ class ContactSolver(Solver):
         passes = self.passes
         given = (passes.params, passes.first, passes.later, self.solver.params, self.correction.params)
         assert library.step(*(c.c_void_p(x.ctypes.data) for x in given), passes.grid) < 200
+
+
+def steps(solver: Solver, library: c.CDLL, count: int, factor_at: int = -1) -> list[tuple[int, int]]:
+    """Iterations of steps on a GPU and a CPU. factor_at: step after which both have a factor of its matrix."""
+    found = []
+    for _ in range(count):
+        step = int(solver.counter[0])
+        ours, theirs = solver.solve(library)
+        assert ours["status"] == 0 and ours["fallbacks"] == 0 and solver.error < 1e-4
+        found.append((int(ours["iterations"]), int(theirs["iterations"])))
+        if step == factor_at:
+            solver.post(solver.matrix, step)
+    return found

@@ -8,7 +8,7 @@ import pytest
 
 from sim_server.backends.gpu.correction import CORRECTED_BODY
 from sim_server.simulation import Simulation
-from tests.backends.pcg_on_threads import SOLVE, STEP, ContactSolver, Solver, compiled
+from tests.backends.pcg_on_threads import SOLVE, STEP, ContactSolver, Solver, compiled, steps
 from tests.contact.scenes import over
 from tests.scenes import bar, simulation
 
@@ -39,19 +39,6 @@ def hold(sim: Simulation, stiffness: float, radius: float) -> int:
     nodes = max(1, int((np.linalg.norm(w.x - END, axis=1) <= radius).sum()))
     at, to = (2.0, 1.0, 0.5), (2.0, 1.1, 0.5)
     return sim.touch.grab("anna", "bar", at, radius, to, nodes * stiffness * block / w.dt**2, 0.0, np.inf).id
-
-
-def steps(solver: Solver, library: c.CDLL, count: int, factor_at: int = -1) -> list[tuple[int, int]]:
-    """Iterations of steps on a GPU and a CPU. factor_at: step after which both have a factor of its matrix."""
-    found = []
-    for _ in range(count):
-        step = int(solver.counter[0])
-        ours, theirs = solver.solve(library)
-        assert ours["status"] == 0 and ours["fallbacks"] == 0 and solver.error < 1e-4
-        found.append((int(ours["iterations"]), int(theirs["iterations"])))
-        if step == factor_at:
-            solver.post(solver.matrix, step)
-    return found
 
 
 def uncorrected(solver: Solver) -> Solver:

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from sim_server.simulation import Simulation
-from tests.backends.pcg_on_threads import SOLVE, Solver, compiled
+from tests.backends.pcg_on_threads import SOLVE, Solver, compiled, steps
 from tests.cutting.cut_scenes import cut, made
 
 SOLVER = {"preconditioner": "cholesky", "update": "never", "tolerance": 1e-8, "max_iterations": 3000}
@@ -21,19 +21,6 @@ def library(tmp_path_factory: pytest.TempPathFactory) -> c.CDLL:
 
 def bar() -> Simulation:
     return made(own={"corotational": {"young": 2e6, "poisson": 0.45}}, solver=SOLVER)
-
-
-def steps(solver: Solver, library: c.CDLL, count: int, factor_at: int = -1) -> list[tuple[int, int]]:
-    """Iterations of steps on a GPU and a CPU. factor_at: step after which both have a factor of its matrix."""
-    found = []
-    for _ in range(count):
-        step = int(solver.counter[0])
-        ours, theirs = solver.solve(library)
-        assert ours["status"] == 0 and ours["fallbacks"] == 0 and solver.error < 1e-4
-        found.append((int(ours["iterations"]), int(theirs["iterations"])))
-        if step == factor_at:
-            solver.post(solver.matrix, step)
-    return found
 
 
 @pytest.mark.parametrize("where", [NOTCH, HALVED])
