@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import os
 import re
+import stat
 from pathlib import Path
 
 
@@ -31,5 +32,13 @@ def later_pieces(path: Path) -> list[tuple[int, Path]]:
 
 def size_of_log(path: Path) -> int:
     """Bytes of all pieces of a log [bytes]; 0 if there is none."""
-    pieces = [path, *(piece for _, piece in later_pieces(path))]
-    return sum(piece.stat().st_size for piece in pieces if piece.is_file())
+    return sum(_bytes(piece) for piece in [path, *(piece for _, piece in later_pieces(path))])
+
+
+def _bytes(piece: Path) -> int:
+    """Bytes of a piece; 0 if it is none, or was removed meanwhile to keep a budget."""
+    try:
+        found = piece.stat()
+    except OSError:
+        return 0
+    return found.st_size if stat.S_ISREG(found.st_mode) else 0
