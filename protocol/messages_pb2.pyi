@@ -298,7 +298,7 @@ class Echo(_message.Message):
     def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., slot: _Optional[_Union[Slot, _Mapping]] = ..., nonce: _Optional[int] = ..., settled: _Optional[bool] = ...) -> None: ...
 
 class ObjectStep(_message.Message):
-    __slots__ = ("header", "step", "time", "iterations", "residual", "status", "factor_step", "factor_age", "preconditioner", "assemble_seconds", "solve_seconds", "integrate_seconds", "step_seconds", "late_seconds", "cpu_seconds", "fallbacks", "excess", "interactions", "asked", "probe", "factor_age_bound", "linearizations", "nonlinear_residual", "kinetic_energy", "elastic_energy", "gravity_energy", "work", "dissipated", "form", "estimate", "contacts", "passes", "clipped", "contact_residual", "substeps", "halvings", "stable_step", "solve_error", "step_error", "readings", "reactions")
+    __slots__ = ("header", "step", "time", "iterations", "residual", "status", "factor_step", "factor_age", "preconditioner", "assemble_seconds", "solve_seconds", "integrate_seconds", "step_seconds", "late_seconds", "cpu_seconds", "fallbacks", "excess", "interactions", "asked", "probe", "factor_age_bound", "linearizations", "nonlinear_residual", "kinetic_energy", "elastic_energy", "gravity_energy", "work", "dissipated", "form", "estimate", "contacts", "passes", "clipped", "contact_residual", "substeps", "halvings", "at_rest", "stable_step", "solve_error", "step_error", "readings", "reactions")
     HEADER_FIELD_NUMBER: _ClassVar[int]
     STEP_FIELD_NUMBER: _ClassVar[int]
     TIME_FIELD_NUMBER: _ClassVar[int]
@@ -335,6 +335,7 @@ class ObjectStep(_message.Message):
     CONTACT_RESIDUAL_FIELD_NUMBER: _ClassVar[int]
     SUBSTEPS_FIELD_NUMBER: _ClassVar[int]
     HALVINGS_FIELD_NUMBER: _ClassVar[int]
+    AT_REST_FIELD_NUMBER: _ClassVar[int]
     STABLE_STEP_FIELD_NUMBER: _ClassVar[int]
     SOLVE_ERROR_FIELD_NUMBER: _ClassVar[int]
     STEP_ERROR_FIELD_NUMBER: _ClassVar[int]
@@ -376,12 +377,13 @@ class ObjectStep(_message.Message):
     contact_residual: float
     substeps: int
     halvings: int
+    at_rest: bool
     stable_step: float
     solve_error: float
     step_error: float
     readings: _containers.RepeatedCompositeFieldContainer[Reading]
     reactions: _containers.RepeatedCompositeFieldContainer[Reaction]
-    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., step: _Optional[int] = ..., time: _Optional[float] = ..., iterations: _Optional[int] = ..., residual: _Optional[float] = ..., status: _Optional[_Union[SolveStatus, str]] = ..., factor_step: _Optional[int] = ..., factor_age: _Optional[int] = ..., preconditioner: _Optional[str] = ..., assemble_seconds: _Optional[float] = ..., solve_seconds: _Optional[float] = ..., integrate_seconds: _Optional[float] = ..., step_seconds: _Optional[float] = ..., late_seconds: _Optional[float] = ..., cpu_seconds: _Optional[float] = ..., fallbacks: _Optional[int] = ..., excess: _Optional[float] = ..., interactions: _Optional[_Iterable[_Union[Interaction, _Mapping]]] = ..., asked: _Optional[str] = ..., probe: _Optional[int] = ..., factor_age_bound: _Optional[int] = ..., linearizations: _Optional[int] = ..., nonlinear_residual: _Optional[float] = ..., kinetic_energy: _Optional[float] = ..., elastic_energy: _Optional[float] = ..., gravity_energy: _Optional[float] = ..., work: _Optional[float] = ..., dissipated: _Optional[float] = ..., form: _Optional[_Union[StepForm, str]] = ..., estimate: _Optional[float] = ..., contacts: _Optional[int] = ..., passes: _Optional[int] = ..., clipped: _Optional[int] = ..., contact_residual: _Optional[float] = ..., substeps: _Optional[int] = ..., halvings: _Optional[int] = ..., stable_step: _Optional[float] = ..., solve_error: _Optional[float] = ..., step_error: _Optional[float] = ..., readings: _Optional[_Iterable[_Union[Reading, _Mapping]]] = ..., reactions: _Optional[_Iterable[_Union[Reaction, _Mapping]]] = ...) -> None: ...
+    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., step: _Optional[int] = ..., time: _Optional[float] = ..., iterations: _Optional[int] = ..., residual: _Optional[float] = ..., status: _Optional[_Union[SolveStatus, str]] = ..., factor_step: _Optional[int] = ..., factor_age: _Optional[int] = ..., preconditioner: _Optional[str] = ..., assemble_seconds: _Optional[float] = ..., solve_seconds: _Optional[float] = ..., integrate_seconds: _Optional[float] = ..., step_seconds: _Optional[float] = ..., late_seconds: _Optional[float] = ..., cpu_seconds: _Optional[float] = ..., fallbacks: _Optional[int] = ..., excess: _Optional[float] = ..., interactions: _Optional[_Iterable[_Union[Interaction, _Mapping]]] = ..., asked: _Optional[str] = ..., probe: _Optional[int] = ..., factor_age_bound: _Optional[int] = ..., linearizations: _Optional[int] = ..., nonlinear_residual: _Optional[float] = ..., kinetic_energy: _Optional[float] = ..., elastic_energy: _Optional[float] = ..., gravity_energy: _Optional[float] = ..., work: _Optional[float] = ..., dissipated: _Optional[float] = ..., form: _Optional[_Union[StepForm, str]] = ..., estimate: _Optional[float] = ..., contacts: _Optional[int] = ..., passes: _Optional[int] = ..., clipped: _Optional[int] = ..., contact_residual: _Optional[float] = ..., substeps: _Optional[int] = ..., halvings: _Optional[int] = ..., at_rest: _Optional[bool] = ..., stable_step: _Optional[float] = ..., solve_error: _Optional[float] = ..., step_error: _Optional[float] = ..., readings: _Optional[_Iterable[_Union[Reading, _Mapping]]] = ..., reactions: _Optional[_Iterable[_Union[Reaction, _Mapping]]] = ...) -> None: ...
 
 class Steps(_message.Message):
     __slots__ = ("header", "steps", "moves")
