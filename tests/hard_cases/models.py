@@ -234,6 +234,7 @@ def case_of(situation: str, name: str, newton: bool = False) -> Case:
         case = replace(case, energy=5, note=TANGENT)
     if situation == "stiffness 1e4":
         case = replace(case, energy=max(case.energy, 1e-8))
+    case = replace(case, easy=(GRAVITY, *model.overrides(), *([NEWTON] if newton else [])))
     key = f"{situation}, Newton" if newton else situation
     return replace(case, **EXPECTED.get((key, name), {}))
 
@@ -241,7 +242,14 @@ def case_of(situation: str, name: str, newton: bool = False) -> Case:
 def with_clamp(situation: str, name: str) -> Case:
     """With one linearization a step, and zeros in place of negative eigenvalues."""
     case = case_of(situation, name)
-    case = replace(case, name=f"{situation}, clamp: {name}", scene=(*case.scene, CLAMP), fails=True, note=OVERSHOT)
+    case = replace(
+        case,
+        name=f"{situation}, clamp: {name}",
+        scene=(*case.scene, CLAMP),
+        easy=(*(case.easy or ()), CLAMP),
+        fails=True,
+        note=OVERSHOT,
+    )
     return replace(case, energy=1e-9)
 
 

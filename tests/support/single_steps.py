@@ -45,12 +45,18 @@ class SingleSteps:
         """One of those of the step."""
         return next(launch for launch in self._assemble if launch.name == name)
 
+    def assemble(self, until: str = "") -> None:
+        """Runs the launches that make A and b, or those before one of them."""
+        for launch in self._assemble:
+            if launch.name == until:
+                return
+            launch()
+
     def step(self) -> bool:
         """Makes a step; returns whether it was solved, so the body does not count as at rest."""
         s = self.sim.system
         s.moving[:] = 0
-        for launch in self._assemble:
-            launch()
+        self.assemble()
         if moving := bool(s.moving[0]):
             s.values[...] = self.of(s.values)
             y = spsolve(self.sim.matrix(0).tocsc(), self.of(s.b_material).ravel().astype(float))

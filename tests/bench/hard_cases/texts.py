@@ -37,15 +37,18 @@ bar, and noise: 1e-2 L/s in the velocities, 1e-10 L in the positions.
   what the run dissipates. It never rises but where a note says why; there, *at dt / 10* is the rise (as a part of the
   same) when the first 150 steps are made with a tenth of the time step.
 - *status*: of all solves of all seeds; *converged* means the true residual, in every step, *residual* the largest of
-  these. *V / V0*: volume over that at rest, smallest and largest. *smallest J*: after the first step.
-- *back*: step from which every node stays within the distance that must hold; *at the end / L*: distance there; where
+  these. *cost*: time and iterations of all steps over those of the same bar made easy (ordinary material and step,
+  hanging under gravity; a bar that spins: at 1 rad/s), of seed 0, step by step beside each other in one process.
+  *V / V0*: volume over that at rest, smallest and largest. *smallest J*: after the first step.
+- *back*: step from which every node stays within the distance that must hold; *straight*: of bars with several
+  equilibria, how many seeds ended in the shape at rest; *at the end / L*: distance there; where
   every step is compared, the largest."""
 EFFECTS = """\
 ## Effects, contact, cuts, loads
 
 Each seed has other masses, places or strengths (tests/hard_cases/effect_table.py, recipe_table.py). Numbers are finite,
 steps are solved or say how they ended, and the figure of *must hold* is at most what stands there; *worst*: of all
-seeds."""
+seeds; *cost*: over the same scene without what is done to it."""
 MODELS = """\
 ## The deformation models
 
