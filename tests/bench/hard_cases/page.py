@@ -304,6 +304,7 @@ def write_page(parts: list[Row], out: Path | None, quick: bool, report: Report |
     if found.names("long"):
         report.say(texts.LONG)
         report.table(long_rows(found))
+        report.say(notes(run for run in LONG_RUNS if run.name in found.names("long")))
     report.data["parts"] = parts
     cases = [row for kind in ("case", "effect", "model") for row in found.of(kind, place=("cpu", "float64"))]
     if cases:
