@@ -200,7 +200,7 @@ class ChunkFile:
                 wanted = opcode in (Opcode.HEADER, Opcode.METADATA, Opcode.CHUNK)
                 yield offset, opcode, ReadDataStream(BytesIO(self._read(body, length) if wanted else b""))
                 offset = body + length
-        except (OSError, struct.error) as error:  # a disk or a network that fails, a file that was removed or is shorter
+        except (OSError, struct.error) as error:  # of a disk or network, or it was removed or cut
             self.problems.append(f"cannot be read from byte {offset} on: {getattr(error, 'strerror', None) or error}")
             return
         self.problems.append(
