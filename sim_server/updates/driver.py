@@ -6,6 +6,7 @@
 """
 
 import logging
+import os
 import re
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -85,8 +86,8 @@ class Driver:
         self.on_epoch: list[Callable[[Body, int], None]] = []  # called before the first job of an epoch of a body
         self.snapshots = SnapshotPool(simulation, self.source, self.policy.expected_latency)
         self.useless_factors = UselessFactors(self)
-        self._checker = ThreadPoolExecutor(1, "checks of factors")
         self.checks: list[FactorUnderCheck] = []  # oldest first
+        self._begin_checks()
         self._observer = SolveObserver(self)
         self._warped = {b.name: b.index in simulation.warped for b in world.bodies}
 
@@ -217,8 +218,16 @@ class Driver:
         matrix = self.snapshots.release(state, factor.step)
         self._take_up(state, factor, self.check.reject_reason(factor, matrix) if is_new else "")
 
+    def _begin_checks(self) -> None:
+        self._checker, self._process = ThreadPoolExecutor(1, "checks of factors"), os.getpid()
+
     def _end_checks(self) -> None:
-        """Takes up the factors whose checks have ended."""
+        """Takes up the factors whose checks have ended. In a process that was forked no thread is at those before."""
+        if self._process != os.getpid():
+            self._begin_checks()
+            lost, self.checks = self.checks, []
+            for check in lost:
+                self.fail(check.factor.object, "its check ended with the process that it was in")
         ended = [each for each in self.checks if each.reason.done()]
         for check in ended:
             self.checks.remove(check)
