@@ -110,9 +110,13 @@ def part_of_ring(ring: NDArray[Any], tail: int, head: int) -> NDArray[Any]:
     """Copies the entries from number `tail` up to `head`, not included, of a ring."""
     first, count = tail % len(ring), head - tail
     out = np.empty((count, *ring.shape[1:]), ring.dtype)
-    raw = np.dtype((np.void, ring.dtype.itemsize))  # NumPy copies structs member by member, ten times as slowly
-    source, target = (a.view(raw) if a.size else a for a in (ring, out))
+    source, target = as_bytes(ring), as_bytes(out)
     straight = min(count, len(ring) - first)
     target[:straight] = source[first : first + straight]
     target[straight:] = source[: count - straight]
     return out
+
+
+def as_bytes(structs: NDArray[Any]) -> NDArray[Any]:
+    """Views structs as bytes, which NumPy copies twenty times as fast: structs it copies member by member."""
+    return structs.view(np.dtype((np.void, structs.dtype.itemsize))) if structs.size else structs
