@@ -497,7 +497,7 @@ class CpuEngine(Reports):
 
     capabilities = frozenset(Capability)
 
-    def __init__(self, given: EngineInput, records: int = 8192, frames: int = 8):
+    def __init__(self, given: EngineInput, records: int | None = None, frames: int = 8):
         self._native = _library()
         spawn = given.cut.spawn if given.cut else None
         others = [part.launches for part in (given.stages, given.euler, given.substeps, given.halving) if part]
