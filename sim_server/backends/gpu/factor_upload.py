@@ -114,6 +114,11 @@ class FactorUpload:
             uploads.queued = GivenFactor(pattern, values, step)
             self._begin_queued(body)
 
+    def post_many(self, given: Sequence[tuple[int, FactorPattern, NDArray[Any], int]]) -> None:
+        """Takes factors of different bodies, each as `post` takes one."""
+        for body, pattern, values, step in given:
+            self.post(body, pattern, values, step)
+
     def advance(self) -> None:
         """Posts what was built beside the caller, and begins the builds that have waited for a storage."""
         with self._lock:
