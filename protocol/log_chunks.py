@@ -26,7 +26,7 @@ from mcap.opcode import Opcode
 from mcap.records import Channel, Chunk, Header, McapRecord, Message, Metadata
 from mcap.writer import MCAP0_MAGIC
 
-from protocol.channels import PROTOCOL
+from protocol.channels import OLDEST_LOG, PROTOCOL
 
 RECORD_LIMIT = 1 << 29  # bytes of one record, compressed or not; twice the limit of a mesh on the wire
 CHUNK_RECORDS = 1 << 18  # records of one chunk; ten times those of the 1 MiB that a recorder fills
@@ -121,7 +121,7 @@ class ChunkFile:
         progress(self.size)
 
     def check_origin(self) -> None:
-        """Raises BadLog unless it is a log of sim-server, of this protocol version. Before messages are decoded."""
+        """Raises BadLog unless it is a log of sim-server of a readable version. Before messages are decoded."""
         if self.problems and not self.metadata:
             raise BadLog(f"{self.path}: nothing readable: {self.problems[0]}")
         if self.header.profile != PROFILE:
@@ -130,8 +130,9 @@ class ChunkFile:
                 f"(profile {self.header.profile!r}, expected {PROFILE!r})"
             )
         version = self.metadata.get("warpfactor", {}).get("protocol", "unknown")
-        if version != str(PROTOCOL):
-            raise BadLog(f"{self.path}: a log of protocol version {version}; this program reads version {PROTOCOL}")
+        if version not in [str(number) for number in range(OLDEST_LOG, PROTOCOL + 1)]:
+            readable = f"versions {OLDEST_LOG} to {PROTOCOL}"
+            raise BadLog(f"{self.path}: a log of protocol version {version}; this program reads {readable}")
 
     def origin(self) -> dict[str, str]:
         """Returns what the writer says of the file at its start; empty if it is not there."""

@@ -102,9 +102,8 @@ def _own(channel: str, server: str, own: str, verb: str = "*") -> str:
     mark = "-own-"
     names = {"command": {"verb": verb, "client": mark}, "alive_client": {"client": mark}}.get(channel)
     if names is None:
-        names = (
-            {"worker": mark} if channel in ("matrix", "matrices", "factors", "worker", "echo", "alive_worker") else {}
-        )
+        of_workers = ("matrix", "matrices", "pattern", "factor", "factors", "worker", "echo", "alive_worker")
+        names = {"worker": mark} if channel in of_workers else {}
     return key(channel, server, **names).replace(mark, own)
 
 

@@ -6,6 +6,7 @@
 """
 
 import logging
+import os
 import re
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -89,8 +90,8 @@ class Driver:
         self.on_epoch: list[Callable[[Body, int], None]] = []  # called before the first job of an epoch of a body
         self.snapshots = SnapshotPool(simulation, self.source, self.policy.expected_latency)
         self.useless_factors = UselessFactors(self)
-        self._checker = ThreadPoolExecutor(1, "checks of factors")
         self.checks: list[FactorsUnderCheck] = []  # oldest first
+        self._begin_checks()
         self._observer = SolveObserver(self)
         self._warped = {b.name: b.index in simulation.warped for b in world.bodies}
 
@@ -229,7 +230,7 @@ class Driver:
                 self._check_beside([factor])
             else:
                 together.append(factor)
-        if beside and len(together) >= MANY:
+        if beside and len(together) >= MANY and together[0].worker != Inline.WORKER:
             self._check_beside(together)
         elif together:
             at_once = [(f, self.snapshots.release(self.by_name[f.object], f.step)) for f in together]
@@ -242,8 +243,16 @@ class Driver:
         reasons = self._checker.submit(self.check.reject_reasons, checked)
         self.checks.append(FactorsUnderCheck(factors, [memory for memory, _ in held], reasons))
 
+    def _begin_checks(self) -> None:
+        self._checker, self._process = ThreadPoolExecutor(1, "checks of factors"), os.getpid()
+
     def _end_checks(self) -> None:
-        """Takes up the factors whose checks have ended."""
+        """Takes up the factors whose checks have ended. In a process that was forked no thread is at those before."""
+        if self._process != os.getpid():
+            self._begin_checks()
+            lost, self.checks = self.checks, []
+            for factor in [factor for check in lost for factor in check.factors]:
+                self.fail(factor.object, "its check ended with the process that it was in")
         ended = [each for each in self.checks if each.reasons.done()]
         for check in ended:
             self.checks.remove(check)

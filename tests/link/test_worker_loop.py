@@ -382,7 +382,7 @@ def test_a_device_that_fails_ends_the_worker_after_an_answer(connection: FakeCon
 @pytest.mark.parametrize(
     ("changes", "kind"),
     [
-        ({"header": Header(protocol=2, incarnation=7, object="beam")}, "version"),
+        ({"header": Header(protocol=PROTOCOL + 1, incarnation=7, object="beam")}, "version"),
         ({"header": Header(protocol=PROTOCOL, incarnation=6, object="beam")}, "incarnation"),
         ({"worker": "x"}, "worker"),
         ({"factor_dtype": "float16"}, "malformed"),
