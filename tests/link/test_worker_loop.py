@@ -58,7 +58,7 @@ class FakeConnection:
     """The network as the worker sees it; answers and patterns pile up here."""
 
     def __init__(self) -> None:
-        self.name, self.incarnation, self.library = "w", 0, ""
+        self.name, self.server, self.incarnation, self.library = "w", "sim", 0, ""
         self.counters = Counters(logging.getLogger("test"))
         self.received: ReceiveQueue[Any] = ReceiveQueue(8)
         self.slots = SlotMap()
@@ -382,7 +382,7 @@ def test_a_device_that_fails_ends_the_worker_after_an_answer(connection: FakeCon
 @pytest.mark.parametrize(
     ("changes", "kind"),
     [
-        ({"header": Header(protocol=2, incarnation=7, object="beam")}, "version"),
+        ({"header": Header(protocol=PROTOCOL + 1, incarnation=7, object="beam")}, "version"),
         ({"header": Header(protocol=PROTOCOL, incarnation=6, object="beam")}, "incarnation"),
         ({"worker": "x"}, "worker"),
         ({"factor_dtype": "float16"}, "malformed"),

@@ -8,11 +8,13 @@ import time
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from protocol.factor import Factor
 from sim_server.updates.body_state import BodyUpdateState
 from sim_server.updates.factor_source import Job
 from sim_server.updates.policies.base import UpdatePolicy
-from sim_server.updates.scheduler import UpdateRequest
+from sim_server.updates.scheduler import Flags, UpdateRequests
 
 if TYPE_CHECKING:
     from sim_server.updates.driver import Driver
@@ -48,7 +50,8 @@ class Lockstep(UpdatePolicy):
         for name, made in list(self._due.items()):
             if made + self.n == now:
                 self._use(name, made)
-        wanted = [driver.by_name[r.object] for r in driver.requests() if self.wants(r, now)]
+        requests = driver.requests()
+        wanted = [driver.bodies[body] for body in requests.body[self.wants(requests, now)].tolist()]
         for state in wanted:
             driver.snapshots.request(state)
         engine.run(1)
@@ -58,17 +61,19 @@ class Lockstep(UpdatePolicy):
             if self._send(state):
                 self._due[state.body.name] = now
 
-    def wants(self, request: UpdateRequest, step: int) -> bool:
-        """True if the object has no job."""
-        return request.object not in self._due
+    def wants(self, requests: UpdateRequests, step: int) -> Flags:
+        """True where the body has no job."""
+        bodies = self.driver.bodies
+        return np.array([bodies[body].body.name not in self._due for body in requests.body.tolist()], np.bool_)
 
     def max_age(self) -> int:
         """Returns 2 n - 1: a factor is n steps old when it comes, and stays for n steps."""
         return 2 * self.n - 1
 
-    def on_factor(self, factor: Factor) -> None:
-        """Keeps a factor until it is due."""
-        self._arrived[factor.object, factor.step] = factor
+    def on_factors(self, factors: Sequence[Factor]) -> None:
+        """Keeps factors until they are due."""
+        for factor in factors:
+            self._arrived[factor.object, factor.step] = factor
 
     def take_back(self, jobs: Sequence[Job]) -> None:
         """Has the jobs sent again before the next step."""
@@ -90,7 +95,7 @@ class Lockstep(UpdatePolicy):
                 begun = time.monotonic()
             time.sleep(POLL_PERIOD)
         if factor := self._arrived.pop((name, made), None):
-            driver.adopt(factor)
+            driver.adopt([factor])
             driver.engine.settle_factors()
         for late in [key for key in self._arrived if key[0] == name]:  # of a job that was given up
             del self._arrived[late]
@@ -98,7 +103,7 @@ class Lockstep(UpdatePolicy):
 
     def _collect(self) -> None:
         for source in {id(s): s for s in (self.driver.source, self.driver.inline)}.values():
-            self.driver.receive(source, self.on_factor)
+            self.driver.receive(source, self.on_factors)
 
     def _send(self, state: BodyUpdateState) -> bool:
         """Sends the copied matrix to a worker as soon as one is idle; factorizes it in this process if there is no
