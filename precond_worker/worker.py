@@ -299,6 +299,8 @@ class Worker:
             if not self._into_slot(message, answer, values):
                 payload = values.tobytes()
         connection.send_factor(answer, payload)
+        if values is not None:
+            self._counters.add("factors")
 
     def _into_slot(self, message: Any, answer: Factor, values: NDArray[Any]) -> bool:
         """Writes the values into the slot lent for them; returns False if there is none that is large enough."""
