@@ -8,8 +8,8 @@ import secrets
 import shutil
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 from google.protobuf.message import Message
 
@@ -21,8 +21,7 @@ from sim_server.recording.rotation import Kept, Rotation, remove_earlier
 ROOM = 2 << 20  # bytes free beside what each file begins with, for a new file after the disk was full
 
 
-@dataclass(frozen=True)
-class Record:
+class Record(NamedTuple):
     """A message to be written. Times in ns.
 
     repeat: place of what each file begins with, as the newest mesh of an object; empty: it is in one file only

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: MIT
 """Simulations in a program of one's own: known motions, views of memory, meshes of arrays, and what is refused."""
 
+import logging
+
 import numpy as np
 import pytest
 
@@ -126,6 +128,37 @@ def test_a_parameter_is_set_between_steps(simulation):
     simulation.set("gravity.g", "[0, -9.81, 0]")
     simulation.step()
     np.testing.assert_allclose(simulation.v[:, 1], -9.81 * DT, atol=1e-6)
+
+
+def test_values_of_numpy_are_set_and_several_at_once_or_none():
+    with wf.Simulation(falling(wf.Mesh(GRID.rest, GRID.tets))) as simulation:
+
+        def values() -> tuple[str, ...]:
+            found = {each.field.key: each.text for each in simulation.inside.parameters}
+            return found["effects.gravity.g"], found["object.cube.effects.corotational.young"]
+
+        simulation.set("gravity.g", np.array([0, -1, 0]))
+        simulation.set("cube.corotational.young", np.float32(2e4))
+        assert values() == ("[0.0, -1.0, 0.0]", "20000.0")
+        simulation.set({"gravity.g": (0, np.int64(-9), 0), "cube.corotational.young": np.int32(30_000)})
+        assert values() == ("[0.0, -9.0, 0.0]", "30000.0")
+        with pytest.raises(InputError, match="young"):
+            simulation.set({"gravity.g": [0, 0, 0], "cube.corotational.young": np.nan})
+        assert values() == ("[0.0, -9.0, 0.0]", "30000.0")
+
+
+def test_what_cuts_in_a_server_alone_is_told(caplog):
+    mesh = {"bar": [1, 1, 2], "size": [0.1, 0.1, 0.2]}
+    with caplog.at_level(logging.WARNING), wf.Simulation(falling(mesh, cutting={"tear": 50})) as simulation:
+        (line,) = [r.getMessage() for r in caplog.records]
+        assert line.startswith("object 'cube' has cutting.tear: that cuts in a server alone")
+        masses = simulation.inside.world.mass.sum()
+        simulation.set("cube.cutting.removed", "0-2")
+        simulation.step()
+        assert simulation.inside.world.mass.sum() < masses
+    caplog.clear()
+    wf.Simulation(falling(mesh, cutting=True)).close()
+    assert not caplog.records
 
 
 def test_a_scene_of_the_package_is_read_with_other_values():

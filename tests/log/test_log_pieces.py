@@ -137,9 +137,7 @@ def in_pieces(path: Path, count: int, due: Due) -> None:
             Due.now = False
 
 
-def test_time_begins_a_new_file_and_an_idle_log_none(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, due: Due
-) -> None:
+def test_time_begins_a_new_file_and_an_idle_log_none(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, due: Due) -> None:
     path = tmp_path / "run.mcap"
     with Recorder(path, rotation=Rotation(seconds=0.3)) as recorder:
         begin(recorder)

@@ -16,7 +16,7 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from protocol.factor import FactorPattern
+from protocol.factor import Factor, FactorPattern
 from sim_server.arrays import Int32
 from sim_server.backends.base import ArrayChange, Capability, CutInput, EngineInput, Launch
 from sim_server.backends.central_difference import NODAL as NODAL_OF_SUBSTEPS
@@ -49,7 +49,7 @@ def _library() -> c.CDLL:
         "backends/cpu/native/loop.cpp",
         {
             "wf_assemble": (None, [loop]), "wf_solve": (None, [loop]), "wf_run": (c.c_int64, [loop, c.c_int64]),
-            "wf_wait": (c.c_int32, [loop]), "wf_restart": (None, [loop, c.c_int32]),
+            "wf_wait": (c.c_int32, [loop]), "wf_restart": (None, [loop, c.c_void_p, c.c_int32]),
             "wf_copy_matrix": (None, [loop, c.c_int32, p]), "wf_note_matrix": (None, [loop, c.c_int32]),
             "wf_post_factor": (p, [c.POINTER(structs.Body), p]), "wf_post_binding": (p, [c.POINTER(structs.Launch), p]),
             "wf_post_changes": (p, [loop, p]), "wf_take_changes": (None, [loop]),
@@ -497,7 +497,7 @@ class CpuEngine(Reports):
 
     capabilities = frozenset(Capability)
 
-    def __init__(self, given: EngineInput, records: int = 8192, frames: int = 8):
+    def __init__(self, given: EngineInput, records: int | None = None, frames: int = 8):
         self._native = _library()
         spawn = given.cut.spawn if given.cut else None
         others = [part.launches for part in (given.stages, given.euler, given.substeps, given.halving) if part]
@@ -683,8 +683,8 @@ class CpuEngine(Reports):
 
     def restart(self, bodies: Sequence[int]) -> None:
         """Begins the energy balances of bodies anew."""
-        for body in bodies:
-            self._native.wf_restart(c.byref(self.loop), body)
+        given = np.array(bodies, np.int32)
+        self._native.wf_restart(c.byref(self.loop), given.ctypes.data, len(given))
 
     def wait(self) -> bool:
         """Sleeps until the next step is due (real time) and while paused, as `run` does before each step.
@@ -770,6 +770,11 @@ class CpuEngine(Reports):
         buffer.fill(values, step)
         self._mail[body].waiting = buffer
         self._native.wf_post_factor(c.byref(self._body[body]), buffer.address)
+
+    def post_factors(self, bodies: Sequence[int], factors: Sequence[Factor]) -> None:
+        """Posts factors of different bodies, one of each."""
+        for body, factor in zip(bodies, factors, strict=True):
+            self.post_factor(body, factor.pattern, factor.values, factor.step)
 
     def prepare_for_factors(self) -> None:
         """Does nothing."""
