@@ -15,6 +15,9 @@ MOST_JOBS = 64  # in flight at one worker, of small objects
 
 KIB, MIB, GIB = 1 << 10, 1 << 20, 1 << 30
 
+PART_BYTES = 4 * MIB  # of a part of a factor: smaller ones cost more time for each byte, larger ones hold others up
+WHOLE_PARTS = 4  # a factor of at most so many parts travels whole
+
 
 @dataclass(frozen=True)
 class Channel:
@@ -42,6 +45,9 @@ CHANNELS: dict[str, Channel] = {
     "matrix": Channel("matrix/{worker}/{object}", "Matrix", "server", "one in flight per object", 64 * KIB, GIB, "job"),
     "pattern": Channel("pattern/{object}", "FactorPattern", "worker", "when it is new", 256 * MIB, 0, "pattern of L"),
     "factor": Channel("factor/{object}", "Factor", "worker", "one per matrix", 64 * KIB, GIB, "values of L"),
+    "part": Channel(
+        "part/{worker}", "FactorPart", "worker", "query, of large factors", 4 * KIB, PART_BYTES, "part of values of L"
+    ),
     "worker": Channel("worker/{worker}", "WorkerInfo", "worker", "5 Hz", 16 * KIB, 0, "hello, then heartbeat"),
     "need": Channel("need", "Need", "server", "2 Hz", KIB, 0, "what more workers are worth to it"),
     "echo": Channel("echo/{worker}", "Echo", "worker", "query, at join", 4 * KIB, 0, "does shared memory work?"),

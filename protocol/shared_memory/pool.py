@@ -156,6 +156,11 @@ class SlotPool:
         if self._lent.pop(id(slot), None) is not None:
             self._free.append(slot)
 
+    def discard(self, slot: Slot) -> None:
+        """Takes back a slot that its borrower may still write to: it is not lent again, its memory is freed."""
+        if self._lent.pop(id(slot), None) is not None:
+            self._live.discard(slot)
+
     def _make(self, capacity: int) -> Slot | None:
         while self._free and not self._fits(capacity):
             self._live.discard(self._free.pop(0))  # the longest unused; its segment is freed with it

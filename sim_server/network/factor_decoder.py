@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Checks and decodes what workers send: patterns of L, and factors as bytes or in a slot of shared memory."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -83,8 +84,8 @@ class FactorDecoder:
             raise Refused(f"Factor.seconds is {message.seconds}; allowed: 0 or more", "malformed")
         return message
 
-    def decode(self, message: FactorMessage, payload: Sized, job: InFlightJob) -> Factor:
-        """Returns the factor that answers a job."""
+    def pattern_of(self, message: FactorMessage, job: InFlightJob) -> FactorPattern:
+        """Checks what a message says of the factor that answers a job, and returns the pattern of its values."""
         for name, value, wanted in (
             ("header.object", message.header.object, job.object),
             ("step", message.step, job.step),
@@ -98,9 +99,19 @@ class FactorDecoder:
             raise Refused(f"Factor.pattern is {message.pattern:016x}, which was not sent before", "pattern")
         if message.nonzeros != pattern.nonzeros:
             raise Refused(f"Factor.nonzeros is {message.nonzeros}; allowed: {pattern.nonzeros}", "shape")
-        in_slot = message.HasField("slot")
-        values = _from_slot(message, job) if in_slot else _from_payload(message, payload)
-        check_values(values, pattern, message.checksum)
+        return pattern
+
+    def decode(
+        self, message: FactorMessage, payload: Sized, job: InFlightJob,
+        fetch: Callable[[], Float32 | Float64] | None = None,
+    ) -> Factor:  # fmt: skip
+        """Returns the factor that answers a job. fetch: returns values that are in parts."""
+        pattern = self.pattern_of(message, job)
+        if fetch is not None:
+            values = fetch()
+        else:
+            values = _from_slot(message, job) if message.HasField("slot") else _from_payload(message, payload)
+        check_values(values, pattern, None if fetch is not None else message.checksum)
         largest = self.objects[job.object].largest
         largest[job.method] = max(largest.get(job.method, 0), pattern.nonzeros)
         return Factor(
