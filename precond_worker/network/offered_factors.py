@@ -38,7 +38,7 @@ class OfferedFactor(NamedTuple):
 class OfferedFactors:
     """Answers questions for parts, in a thread of its own, so that the worker goes on with its next job meanwhile.
 
-    The answers have a low priority: small factors and heartbeats overtake the parts of a large factor.
+    The answers have the priority of the question, a low one: small factors and heartbeats overtake the parts of a large factor.
     """
 
     def __init__(
@@ -114,10 +114,7 @@ class OfferedFactors:
         check_header(question)
         with self._lock:
             answer, payload = self._part(question)
-        query.reply(
-            self._key, payload, attachment=answer.SerializeToString(),
-            congestion_control=zenoh.CongestionControl.BLOCK, priority=zenoh.Priority.DATA_LOW,
-        )  # fmt: skip
+        query.reply(self._key, payload, attachment=answer.SerializeToString())
 
     def _part(self, question: FactorPart) -> tuple[FactorPart, bytes]:
         """Returns the answer to a question, and the part unless it was written into a slot."""

@@ -117,6 +117,7 @@ class FactorFetch:
             return self._session.get(
                 self._key, FifoChannel(ANSWERS), payload=question.SerializeToString(), timeout=QUESTION_TIME,
                 target=ALL, consolidation=NONE, priority=zenoh.Priority.DATA_LOW,
+                congestion_control=zenoh.CongestionControl.BLOCK,
             )  # fmt: skip
         except zenoh.ZError as error:
             raise Refused(f"a part of a factor was not asked for: {error}", "late") from error
