@@ -6,7 +6,8 @@ from dataclasses import dataclass
 
 from protocol.refused import Refused
 
-PROTOCOL = 1  # wire version; grows when a message changes its meaning
+PROTOCOL = 2  # wire version; grows when a message changes its meaning or its key
+OLDEST_LOG = 1  # wire version of the oldest logs that are read; their messages mean what they did
 ROOT = "warpfactor"
 SERVER_NAME = "sim"
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"  # loopback: a server listens on other interfaces only when asked
@@ -43,8 +44,18 @@ CHANNELS: dict[str, Channel] = {
         "checkpoint", "Checkpoint", "server", "queryable", 256 * MIB, 0, "the state that was saved last"
     ),
     "matrix": Channel("matrix/{worker}/{object}", "Matrix", "server", "one in flight per object", 64 * KIB, GIB, "job"),
-    "pattern": Channel("pattern/{object}", "FactorPattern", "worker", "when it is new", 256 * MIB, 0, "pattern of L"),
-    "factor": Channel("factor/{object}", "Factor", "worker", "one per matrix", 64 * KIB, GIB, "values of L"),
+    "pattern": Channel(
+        "pattern/{worker}/{object}", "FactorPattern", "worker", "when it is new", 256 * MIB, 0, "pattern of L"
+    ),
+    "factor": Channel(
+        "factor/{worker}/{object}",
+        "Factor",
+        "worker",
+        "one per matrix",
+        64 * KIB,
+        WHOLE_PARTS * PART_BYTES,
+        "values of L",
+    ),
     "part": Channel(
         "part/{worker}", "FactorPart", "worker", "query, of large factors", 4 * KIB, PART_BYTES, "part of values of L"
     ),

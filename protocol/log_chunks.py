@@ -8,6 +8,7 @@ server was killed has no index, and everything up to the last complete chunk can
 from __future__ import annotations
 
 import contextlib
+import errno
 import os
 import struct
 import zlib
@@ -25,7 +26,7 @@ from mcap.opcode import Opcode
 from mcap.records import Channel, Chunk, Header, McapRecord, Message, Metadata
 from mcap.writer import MCAP0_MAGIC
 
-from protocol.channels import PROTOCOL
+from protocol.channels import OLDEST_LOG, PROTOCOL
 
 RECORD_LIMIT = 1 << 29  # bytes of one record, compressed or not; twice the limit of a mesh on the wire
 CHUNK_RECORDS = 1 << 18  # records of one chunk; ten times those of the 1 MiB that a recorder fills
@@ -42,11 +43,15 @@ class BadLog(ValueError):
     """The file is no log, or one of another protocol version; the text names the file."""
 
 
+class NoFile(BadLog):
+    """There is no such file."""
+
+
 @dataclass
 class ChunkFile:
     """The records of one file. `problems` and `complete` are known once `scan` has ended.
 
-    Raises BadLog from `open` if there is no such file or it is no MCAP file.
+    Raises NoFile from `open` if there is no such file, BadLog if it is no MCAP file.
     """
 
     path: Path
@@ -57,16 +62,21 @@ class ChunkFile:
     problems: list[str] = field(default_factory=list)
     complete: bool = False  # the end mark was seen: the writer closed the file
     announced: int | None = None  # number of messages according to the writer
+    _inode: int = 0
+
+    def __post_init__(self) -> None:
+        self._inode = os.fstat(self.stream.fileno()).st_ino
 
     @classmethod
     def open(cls, path: Path) -> Self:
-        """Opens a file. Raises BadLog if there is none, or it is no MCAP file."""
+        """Opens a file. Raises NoFile if there is none, BadLog if it is no MCAP file."""
         try:
             stream = path.open("rb")
             size = os.fstat(stream.fileno()).st_size
             magic = stream.read(len(MCAP0_MAGIC))
         except OSError as error:
-            raise BadLog(f"{path}: cannot be read: {error.strerror}") from None
+            kind = NoFile if error.errno == errno.ENOENT else BadLog
+            raise kind(f"{path}: cannot be read: {error.strerror}") from None
         if magic != MCAP0_MAGIC:
             stream.close()
             raise BadLog(
@@ -75,7 +85,19 @@ class ChunkFile:
         return cls(path, stream, size)
 
     def close(self) -> None:
+        """Closes the file; it is opened again where it is read again."""
         self.stream.close()
+
+    def _read(self, offset: int, count: int) -> bytes:
+        """Returns bytes of the file. Raises OSError, also if another file has its name by now."""
+        if self.stream.closed:
+            stream = self.path.open("rb")
+            if os.fstat(stream.fileno()).st_ino != self._inode:
+                stream.close()
+                raise OSError(errno.ESTALE, "the file was replaced")
+            self.stream = stream
+        self.stream.seek(offset)
+        return self.stream.read(count)
 
     def scan(self, progress: Callable[[int], None] = lambda _: None) -> Iterator[tuple[int, list[McapRecord]]]:
         """Yields (byte offset, records) of every readable chunk in file order; `progress` gets the offset reached."""
@@ -99,7 +121,7 @@ class ChunkFile:
         progress(self.size)
 
     def check_origin(self) -> None:
-        """Raises BadLog unless it is a log of sim-server, of this protocol version. Before messages are decoded."""
+        """Raises BadLog unless it is a log of sim-server of a readable version. Before messages are decoded."""
         if self.problems and not self.metadata:
             raise BadLog(f"{self.path}: nothing readable: {self.problems[0]}")
         if self.header.profile != PROFILE:
@@ -108,8 +130,9 @@ class ChunkFile:
                 f"(profile {self.header.profile!r}, expected {PROFILE!r})"
             )
         version = self.metadata.get("warpfactor", {}).get("protocol", "unknown")
-        if version != str(PROTOCOL):
-            raise BadLog(f"{self.path}: a log of protocol version {version}; this program reads version {PROTOCOL}")
+        if version not in [str(number) for number in range(OLDEST_LOG, PROTOCOL + 1)]:
+            readable = f"versions {OLDEST_LOG} to {PROTOCOL}"
+            raise BadLog(f"{self.path}: a log of protocol version {version}; this program reads {readable}")
 
     def origin(self) -> dict[str, str]:
         """Returns what the writer says of the file at its start; empty if it is not there."""
@@ -134,18 +157,27 @@ class ChunkFile:
         return notes
 
     def chunk(self, offset: int) -> list[McapRecord]:
-        """Returns the records of the chunk at `offset`, one that `scan` has yielded."""
-        self.stream.seek(offset)
-        _, length = struct.unpack("<BQ", self.stream.read(9))
-        return unpack(Chunk.read(ReadDataStream(BytesIO(self.stream.read(length)))))
+        """Returns the records of the chunk at `offset`, one that `scan` has yielded.
+
+        Raises BadLog if it is not there any more: the file was changed or removed since.
+        """
+        try:
+            opcode, length = _HEAD.unpack(self._read(offset, _HEAD.size))
+            if opcode != Opcode.CHUNK or length > RECORD_LIMIT:
+                raise ValueError("another block is there")
+            return unpack(Chunk.read(ReadDataStream(BytesIO(self._read(offset + _HEAD.size, length)))))
+        except (OSError, *BROKEN) as error:
+            raise BadLog(
+                f"{self.path}: the block at byte {offset} cannot be read again, the file was changed or removed "
+                f"since it was opened ({error})"
+            ) from None
 
     def _statistics(self, offset: int) -> int | None:
         """Returns the number of messages in the summary that begins at `offset`; None without a summary."""
         while offset + _HEAD.size <= self.size:
-            self.stream.seek(offset)
-            opcode, length = _HEAD.unpack(self.stream.read(_HEAD.size))
+            opcode, length = _HEAD.unpack(self._read(offset, _HEAD.size))
             if opcode == Opcode.STATISTICS and length >= 8 and offset + _HEAD.size + 8 <= self.size:
-                return int.from_bytes(self.stream.read(8), "little")
+                return int.from_bytes(self._read(offset + _HEAD.size, 8), "little")
             if opcode in (0, Opcode.FOOTER) or length > RECORD_LIMIT:
                 return None
             offset += _HEAD.size + length
@@ -153,21 +185,25 @@ class ChunkFile:
 
     def _records(self) -> Iterator[tuple[int, int, ReadDataStream]]:
         offset = len(MCAP0_MAGIC)
-        while offset + 9 <= self.size:
-            self.stream.seek(offset)
-            opcode, length = struct.unpack("<BQ", self.stream.read(9))
-            if opcode == Opcode.DATA_END:
-                self.complete = True
-                self.announced = self._statistics(offset + 9 + length)
-                return
-            if opcode == 0 or length > RECORD_LIMIT:
-                self.problems.append(f"damaged at byte {offset}: nothing after that is read")
-                return
-            if offset + 9 + length > self.size:
-                break
-            wanted = opcode in (Opcode.HEADER, Opcode.METADATA, Opcode.CHUNK)
-            yield offset, opcode, ReadDataStream(BytesIO(self.stream.read(length) if wanted else b""))
-            offset += 9 + length
+        try:
+            while offset + _HEAD.size <= self.size:
+                opcode, length = _HEAD.unpack(self._read(offset, _HEAD.size))
+                body = offset + _HEAD.size
+                if opcode == Opcode.DATA_END:
+                    self.complete = True
+                    self.announced = self._statistics(body + length)
+                    return
+                if opcode == 0 or length > RECORD_LIMIT:
+                    self.problems.append(f"damaged at byte {offset}: nothing after that is read")
+                    return
+                if body + length > self.size:
+                    break
+                wanted = opcode in (Opcode.HEADER, Opcode.METADATA, Opcode.CHUNK)
+                yield offset, opcode, ReadDataStream(BytesIO(self._read(body, length) if wanted else b""))
+                offset = body + length
+        except (OSError, struct.error) as error:  # of a disk or network, or it was removed or cut
+            self.problems.append(f"cannot be read from byte {offset} on: {getattr(error, 'strerror', None) or error}")
+            return
         self.problems.append(
             f"ends at byte {self.size} without an end mark: the server was killed, or is still recording"
         )

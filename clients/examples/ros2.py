@@ -21,6 +21,7 @@ import math
 import sys
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -104,11 +105,15 @@ class Bridge:
         """Publishes what is new."""
         for frame in self.states.newest():
             self.send("publish", f"{frame.object}/points", msg=point_cloud(frame, self.frame_id))
-        for name, tool in self.tools.items():
-            self.send("publish", f"{name}/wrench", msg=wrench(tool.force, tool.torque, self.frame_id))
+        forces = self.client.forces
+        for name in self.tools:
+            with suppress(ClientError):  # no step has come so far
+                load = forces.obstacle(name, timeout=0)
+                self.send("publish", f"{name}/wrench", msg=wrench(load.force, load.torque, self.frame_id))
         for name, grab in self.grabs.items():
-            force = [-f for f in grab.force]
-            self.send("publish", f"{name}/grab_wrench", msg=wrench(force, (0, 0, 0), self.frame_id))
+            with suppress(ClientError):  # the newest step is not with the grab: it begins, or is over
+                hand = forces.grab(grab.interaction.id, timeout=0).force
+                self.send("publish", f"{name}/grab_wrench", msg=wrench(hand, (0, 0, 0), self.frame_id))
 
     def receive(self, until: float) -> None:
         """Obeys what comes until a time (time.monotonic) [s]; what cannot be obeyed is told."""
@@ -117,6 +122,10 @@ class Bridge:
                 message = json.loads(self.ros.recv(timeout=left))
             except TimeoutError:
                 return
+            except ValueError as error:
+                message = {"op": "status", "level": "error", "msg": f"no JSON: {error}"}
+            if not isinstance(message, dict):
+                continue
             if message.get("op") == "status":
                 print(f"rosbridge: {message.get('level')}: {message.get('msg')}", file=sys.stderr, flush=True)
             elif message.get("op") == "publish" and message.get("topic") in self.taken:
@@ -138,7 +147,11 @@ class Bridge:
         """Grabs the node next to a point, or moves the grab that there is."""
         x, y, z = triple(message["point"], *"xyz")
         if name in self.grabs:
-            self.grabs[name].move((x, y, z), wait=False)
+            try:
+                self.grabs[name].move((x, y, z), wait=False)
+            except BadInput:  # it is over, as after a reset: the next point begins another one
+                del self.grabs[name]
+                raise
         else:
             self.grabs[name] = self.client.grab(name, (x, y, z), None, 0, self.stiffness, self.max_force)
 
@@ -164,10 +177,14 @@ def main() -> None:
         with Client(o.server) as client, connect(o.rosbridge, max_size=1 << 20) as ros:
             bridge = Bridge(client, ros, o.frame, o.stiffness, o.max_force)
             print(f"ros2: {', '.join(bridge.objects)} at {o.rosbridge}", flush=True)
+            alive = time.monotonic()
             while True:
                 until = time.monotonic() + 1 / o.rate
                 bridge.publish()
                 bridge.receive(until)
+                if until > alive + 1:
+                    client.status()  # raises when the server is gone
+                    alive = until
     except (BadInput, ClientError, OSError, WebSocketException) as error:
         sys.exit(f"ros2: {error}")
     except KeyboardInterrupt:

@@ -110,7 +110,7 @@ class Log:
         frames = self.object_log(name).frames
         if not -len(frames) <= index < len(frames):
             raise BadInput(f"{self.path}: no frame {index} of object {name!r}; {len(frames)} frames were recorded")
-        frame = frame_of(pb.State.FromString(self._file.data(*frames[index][2:])))
+        frame = frame_of(pb.State.FromString(self._data(*frames[index][2:])))
         nodes = self.object_log(name).meshes.nodes(frame.epoch)
         if nodes not in (None, len(frame.x)):
             raise BadInput(f"{self.path}: step {frame.step} of {name!r} has {len(frame.x)} nodes, its mesh has {nodes}")
@@ -128,6 +128,11 @@ class Log:
 
     def __exit__(self, *_: object) -> None:
         self.close()
+
+    def _data(self, offset: int, number: int) -> bytes:
+        """Returns the data of a message. Raises BadInput if the file was changed since it was opened."""
+        with bad_log_is_bad_input():
+            return self._file.data(offset, number)
 
     def _meshes(self, name: str, epoch: int) -> Meshes:
         meshes = self.object_log(name).meshes
@@ -156,7 +161,7 @@ class Log:
         if message.kind not in ("topology", "state", "step", "interaction", "factor") or not message.object:
             raise Refused("a message of an unknown channel")
         if message.object not in self.objects:
-            self.objects[message.object] = ObjectLog(message.object, Meshes(self._file.data))
+            self.objects[message.object] = ObjectLog(message.object, Meshes(self._data))
         found = self.objects[message.object]
         if message.kind == "topology":
             found.meshes.add(pb.Topology.FromString(message.data), message.offset, message.number)

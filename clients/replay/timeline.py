@@ -59,12 +59,13 @@ class Timeline:
 
     def between(self, begin: float, end: float) -> Iterator[tuple[float, str, Message]]:
         """Yields (time [s], object or obstacle, message) with begin <= time <= end in order, after the topologies and
-        obstacles before it."""
+        obstacles before it. Raises BadInput if the file was changed since it was opened."""
         places = self._places
         times = places["time"] / 1e9
         wanted = ((times >= begin) | np.array(ONCE)[places["kind"]]) & (times <= end)
         for place in places[wanted]:
-            data = self._file.data(int(place["offset"]), int(place["number"]))
+            with bad_log_is_bad_input():
+                data = self._file.data(int(place["offset"]), int(place["number"]))
             try:
                 message = KINDS[place["kind"]][1].FromString(data)
             except DecodeError:

@@ -38,7 +38,8 @@ class OfferedFactor(NamedTuple):
 class OfferedFactors:
     """Answers questions for parts, in a thread of its own, so that the worker goes on with its next job meanwhile.
 
-    The answers have the priority of the question, a low one: small factors and heartbeats overtake the parts of a large factor.
+    The answers have the priority of the question, a low one: small factors and heartbeats overtake
+    parts.
     """
 
     def __init__(

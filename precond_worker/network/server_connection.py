@@ -189,12 +189,12 @@ class ServerConnection:
     def send_pattern(self, pattern: FactorPattern, object: str, epoch: int) -> None:
         """Sends the pattern of an object's factors."""
         message = pattern.message(self.header(object, epoch, "pattern"))
-        name = key("pattern", self.server, object=object)
+        name = key("pattern", self.server, worker=self.name, object=object)
         self._session.zenoh.put(name, message.SerializeToString(), congestion_control=BLOCK)
 
     def send_factor(self, message: Factor, values: bytes = b"") -> None:
         """Sends a factor or a failure; values: of the factor if they are in no slot."""
-        name = key("factor", self.server, object=message.header.object)
+        name = key("factor", self.server, worker=self.name, object=message.header.object)
         self._session.zenoh.put(name, values, attachment=message.SerializeToString(), congestion_control=BLOCK)
 
     def leave(self) -> None:

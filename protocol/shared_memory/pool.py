@@ -9,6 +9,7 @@ begins with a header of 64 bytes with its generation, which grows each time it i
 import mmap
 import os
 import secrets
+from collections import deque
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -52,6 +53,7 @@ class Slot:
         self._bytes = np.frombuffer(memory, np.uint8, capacity + HEADER, start)
         self._generation = self._bytes[:8].view(np.uint64)
         self.generation = 0
+        self.returned = 0  # when it was given back last, counted by the pool
 
     def lend(self) -> None:
         """Begins a new generation, by which late writes of an earlier borrower are recognized."""
@@ -110,8 +112,9 @@ class SlotPool:
 
     def __init__(self, limit: int = shm_limits.POOL_LIMIT):
         self.limit = limit
-        self._free: list[Slot] = []
-        self._lent: dict[int, Slot] = {}
+        self._free: dict[int, deque[Slot]] = {}  # by capacity, each the longest unused first
+        self._lent: dict[int, int] = {}  # how many still use it, by id
+        self._returns = 0
         self._live: set[Slot] = set()
         self._probe()
 
@@ -138,23 +141,28 @@ class SlotPool:
         """Number of slots lent now. A probe for tests."""
         return len(self._lent)
 
-    def lend(self, size: int) -> Slot | None:
-        """Lends a slot for `size` bytes, in a new generation; returns None if there is no memory for it."""
-        fitting = [slot for slot in self._free if size <= slot.capacity <= 4 * max(size, SMALLEST)]
-        slot = min(fitting, key=lambda slot: slot.capacity, default=None)
-        if slot is not None:
-            self._free.remove(slot)
-        else:
-            slot = self._make(_rounded(size))
+    def lend(self, size: int, users: int = 1) -> Slot | None:
+        """Lends a slot for `size` bytes, in a new generation; returns None if there is no memory for it.
+
+        users: it is free again once it was given back so many times
+        """
+        most = 4 * max(size, SMALLEST)
+        capacity = min((c for c, slots in self._free.items() if slots and size <= c <= most), default=None)
+        slot = self._make(_rounded(size)) if capacity is None else self._free[capacity].pop()
         if slot is not None:
             slot.lend()
-            self._lent[id(slot)] = slot
+            self._lent[id(slot)] = users
         return slot
 
     def give_back(self, slot: Slot) -> None:
-        """Takes a slot back; a slot that is not lent is ignored."""
-        if self._lent.pop(id(slot), None) is not None:
-            self._free.append(slot)
+        """Takes a slot back from one of its users; a slot that is not lent is ignored."""
+        users = self._lent.pop(id(slot), 0)
+        if users > 1:
+            self._lent[id(slot)] = users - 1
+        elif users == 1:
+            self._returns += 1
+            slot.returned = self._returns
+            self._free.setdefault(slot.capacity, deque()).append(slot)
 
     def discard(self, slot: Slot) -> None:
         """Takes back a slot that its borrower may still write to: it is not lent again, its memory is freed."""
@@ -162,8 +170,9 @@ class SlotPool:
             self._live.discard(slot)
 
     def _make(self, capacity: int) -> Slot | None:
-        while self._free and not self._fits(capacity):
-            self._live.discard(self._free.pop(0))  # the longest unused; its segment is freed with it
+        while not self._fits(capacity) and (unused := [slots for slots in self._free.values() if slots]):
+            oldest = min(unused, key=lambda slots: slots[0].returned)
+            self._live.discard(oldest.popleft())  # its segment is freed with it
         if not self._fits(capacity):
             return None
         try:

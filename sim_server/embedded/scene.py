@@ -57,7 +57,7 @@ class Scene:
     def __init__(self, table: Mapping[str, Any] | None = None, folder: str | Path = ".", **keys: Any):
         if twice := sorted((table or {}).keys() & keys.keys()):
             raise InputError(f"scene: {twice[0]} is given twice, in the table and as a keyword")
-        self._source: dict[str, Any] | tuple[Path, Sequence[str]] = _plain({**(table or {}), **keys})
+        self._source: dict[str, Any] | tuple[Path, Sequence[str]] = plain({**(table or {}), **keys})
         self._folder = Path(folder)
         self.checked = scenes.validated(copy.deepcopy(self._source), FROM, self._folder)
 
@@ -73,7 +73,7 @@ class Scene:
         """Returns the scene with other values, by key as after --set: "solver.tolerance",
         "object.beam.effects.corotational.young". A text is a value as on the command line. Raises InputError.
         """
-        given = [f"{key}={value if isinstance(value, str) else toml(_plain(value))}" for key, value in values.items()]
+        given = [f"{key}={value if isinstance(value, str) else toml(plain(value))}" for key, value in values.items()]
         if isinstance(self._source, tuple):
             path, before = self._source
             return type(self).load(path, [*before, *given])
@@ -108,12 +108,12 @@ class Scene:
         return type(self), (self._source, self._folder.resolve())
 
 
-def _plain(value: Any) -> Any:
+def plain(value: Any) -> Any:
     """Returns a value in which numbers, arrays, paths and meshes are such as scenes take."""
     if isinstance(value, Mapping):
-        return {key: _plain(each) if key not in ("points", "tets", "groups") else each for key, each in value.items()}
+        return {key: plain(each) if key not in ("points", "tets", "groups") else each for key, each in value.items()}
     if isinstance(value, list | tuple):
-        return [_plain(each) for each in value]
+        return [plain(each) for each in value]
     if isinstance(value, np.ndarray | np.generic):
         return value.tolist()
     if isinstance(value, Path):

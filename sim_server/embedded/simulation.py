@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: MIT
 """Simulations within a program of one's own, without a network."""
 
-import json
 import logging
 import weakref
 from collections.abc import Mapping, Sequence
@@ -17,9 +16,10 @@ from sim_server.arrays import Float64
 from sim_server.effects._base import Effect
 from sim_server.embedded.external_forces import ExternalForces
 from sim_server.embedded.factor_threads import FactorThreads, NoFactors
-from sim_server.embedded.scene import Scene
+from sim_server.embedded.scene import Scene, plain
 from sim_server.errors import InputError
 from sim_server.mechanics.named_points import NamedPoints
+from sim_server.parameters import toml
 from sim_server.state.start import Start
 from sim_server.updates.driver import Driver
 from sim_server.updates.factor_source import FactorSource
@@ -167,10 +167,14 @@ class Simulation:
         except ValueError as error:
             raise InputError(f"push: {error}") from None
 
-    def set(self, key: str, value: float | bool | str | Sequence[Any]) -> None:
-        """Changes a live parameter before the next step, e.g. "beam.corotational.young". Raises InputError."""
+    def set(self, key: str | Mapping[str, Any], value: Any = None) -> None:
+        """Changes a live parameter before the next step, e.g. "beam.corotational.young", or several at once, a mapping
+        of values by key, all or none of them. Values may be those of NumPy; a text is a value as on the command line.
+        Raises InputError."""
+        values = key if isinstance(key, Mapping) else {key: value}
+        given = {k: each if isinstance(each, str) else toml(plain(each)) for k, each in values.items()}
         try:
-            self._open.simulation.parameters.set({key: value if isinstance(value, str) else json.dumps(value)})
+            self._open.simulation.parameters.set(given)
         except ValueError as error:
             raise InputError(str(error)) from None
 

@@ -180,10 +180,11 @@ class VectorEnv(vector.VectorEnv[Float64, Any, Any]):
     def _begin(self, mask: Bools) -> None:
         """Puts copies back to the start, with new parameters."""
         chosen = np.flatnonzero(mask).tolist()
-        for k in chosen if self._randomize else ():
-            assert self._randomize is not None
-            for key, value in self._randomize(self._random[k]).items():
-                self.simulation.set(self._key(key, k), value)
+        if self._randomize is not None:
+            drawn = [(k, self._randomize(self._random[k])) for k in chosen]
+            values = {self._key(key, k): value for k, each in drawn for key, value in each.items()}
+            if values:  # all at once: each change has the whole scene checked
+                self.simulation.set(values)
         everything = len(chosen) == self.num_envs
         self.simulation.reset(*([] if everything else [name for k in chosen for name in self._copies.of(k)]))
         self._action.begin(chosen)

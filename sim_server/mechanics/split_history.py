@@ -3,8 +3,7 @@
 
 from __future__ import annotations
 
-from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Protocol
 
 from sim_server.arrays import Int32
@@ -35,17 +34,41 @@ class _Change:
     scene: Scene
 
 
+@dataclass(frozen=True)
+class _Epochs:
+    """Those of one body. Made anew with each change, as another thread may be reading them.
+
+    start: pattern before the first change that is kept; dropped: changes before it, which were taken
+    """
+
+    start: Pattern
+    changes: tuple[_Change, ...] = ()
+    dropped: int = 0
+
+    def taken(self) -> list[_Change]:
+        return [change for change in self.changes if change.update.taken >= 0]
+
+    def with_change(self, change: _Change) -> _Epochs:
+        """Returns these with one more, and without the first one if there are too many. The loop may never have taken
+        that up: it was replaced by the next one then, and has no epoch."""
+        if len(self.changes) < KEPT:
+            return replace(self, changes=(*self.changes, change))
+        first, changes = self.changes[0], (*self.changes[1:], change)
+        if first.update.taken < 0:
+            return replace(self, changes=changes)
+        return _Epochs(first.pattern, changes, self.dropped + 1)
+
+
 class SplitHistory:
     """Epochs of all bodies, 1 at the start and one more with each change of what a body is split into.
 
-    The matrix of a step is of the epoch that `at` returns for the steps completed before it.
+    The matrix of a step is of the epoch that `at` returns for the steps completed before it. Several threads may ask
+    while one calls `on_set`.
     """
 
     def __init__(self, system: System):
-        self._system, bodies = system, system.world.bodies
-        self._start = {b.name: system.body_pattern(b.first, b.last) for b in bodies}
-        self._changes: dict[str, deque[_Change]] = {b.name: deque(maxlen=KEPT) for b in bodies}
-        self._dropped = {b.name: 0 for b in bodies}  # changes that are no longer kept
+        self._system = system
+        self._of = {b.name: _Epochs(system.body_pattern(b.first, b.last)) for b in system.world.bodies}
 
     def on_set(self, update: Update, scene: Scene) -> None:
         """Takes note of parameters that were given to the loop."""
@@ -53,25 +76,22 @@ class SplitHistory:
         for body in self._system.world.bodies:
             if followed is None or KEY.format(body.name) not in update.values:
                 continue
-            changes = self._changes[body.name]
-            if len(changes) == KEPT and changes[0].update.taken >= 0:
-                self._dropped[body.name] += 1
-                self._start[body.name] = changes[0].pattern
-            pattern = followed.body_pattern(scene, body.first, body.last)
-            changes.append(_Change(update, pattern, scene))
+            change = _Change(update, followed.body_pattern(scene, body.first, body.last), scene)
+            self._of[body.name] = self._of[body.name].with_change(change)
 
     def at(self, name: str, step: int) -> int:
         """Returns the epoch of an object in the matrix assembled after `step` completed steps."""
-        return 1 + self._dropped[name] + sum(0 <= change.update.taken <= step for change in tuple(self._changes[name]))
+        epochs = self._of[name]
+        return 1 + epochs.dropped + sum(0 <= change.update.taken <= step for change in epochs.changes)
 
     def pattern(self, name: str, epoch: int) -> Pattern:
         """Returns row_start and columns of A of an object in an epoch, nodes numbered from 0."""
-        taken = [change for change in tuple(self._changes[name]) if change.update.taken >= 0]
-        number = epoch - 1 - self._dropped[name]
-        return self._start[name] if number <= 0 else taken[number - 1].pattern
+        epochs = self._of[name]
+        number = epoch - 1 - epochs.dropped
+        return epochs.start if number <= 0 else epochs.taken()[number - 1].pattern
 
     def scene(self, name: str, epoch: int) -> Scene | None:
         """Returns the scene with the parameters of an epoch; None: that of the start."""
-        taken = [change for change in tuple(self._changes[name]) if change.update.taken >= 0]
-        number = epoch - 1 - self._dropped[name]
-        return None if number <= 0 else taken[number - 1].scene
+        epochs = self._of[name]
+        number = epoch - 1 - epochs.dropped
+        return None if number <= 0 else epochs.taken()[number - 1].scene

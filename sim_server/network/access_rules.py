@@ -104,7 +104,11 @@ def _own(channel: str, server: str, own: str, verb: str = "*") -> str:
     mark = "-own-"
     names = {"command": {"verb": verb, "client": mark}, "alive_client": {"client": mark}}.get(channel)
     if names is None:
-        names = {"worker": mark} if channel in ("matrix", "part", "worker", "echo", "alive_worker") else {}
+        names = (
+            {"worker": mark}
+            if channel in ("matrix", "pattern", "factor", "part", "worker", "echo", "alive_worker")
+            else {}
+        )
     return key(channel, server, **names).replace(mark, own)
 
 

@@ -79,6 +79,8 @@ class FactorDecoder:
         message = parse(FactorMessage, attachment, CHANNELS["factor"].limit)
         self._object(message, key, "factor")
         check_strings(message)
+        if message.worker != name_in("factor", key, "worker"):  # access rules go by the key
+            raise Refused(f"Factor.worker is {message.worker!r}, its key is {key}", "worker")
         check_numbers(message)
         if message.seconds < 0:
             raise Refused(f"Factor.seconds is {message.seconds}; allowed: 0 or more", "malformed")

@@ -75,6 +75,9 @@ class WorkerTiming:
         idle: (worker, time [s] since when it is idle)
         busy: (worker, object, time [s] since its job was sent)
         """
+        busy = list(busy)
+        if not busy:
+            return 0
         known = [min(times.values()) for times in self._seconds.values() if times]
         own, since = min(((self.slowness(worker), -since) for worker, since in idle), default=(0.0, 0.0))
         if not own or not known:

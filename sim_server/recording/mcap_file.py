@@ -6,6 +6,7 @@ from __future__ import annotations
 import contextlib
 import errno
 import os
+import stat
 from pathlib import Path
 
 from google.protobuf.message import Message
@@ -36,7 +37,9 @@ class McapFile:
             raise InputError(f"{path}: the file exists: remove it or choose another name for the log") from None
         except OSError as error:
             raise InputError(f"{path}: a log cannot be written there: {error.strerror}") from None
-        self._linked = os.fstat(self._stream.fileno()).st_nlink > 0  # some file systems do not count links
+        found = os.fstat(self._stream.fileno())
+        self.regular = stat.S_ISREG(found.st_mode)
+        self._linked = found.st_nlink > 0  # some file systems do not count links
         self._writer = Writer(self._stream, chunk_size=CHUNK_BYTES, compression=COMPRESSIONS[compression])
         self._schemas: dict[type[Message], int] = {}
         self._channels: dict[str, int] = {}
@@ -62,17 +65,24 @@ class McapFile:
         if self._linked and os.fstat(self._stream.fileno()).st_nlink == 0:
             raise OSError(errno.ENOENT, "the file was removed or replaced")
 
-    def finish(self, notes: dict[str, str]) -> None:
-        """Writes `notes` and the index, and closes. Raises OSError."""
+    def finish(self, notes: dict[str, str]) -> int:
+        """Writes `notes` and the index, and closes; returns the bytes of the file. Raises OSError."""
         self._writer.add_metadata("recorder", notes)
         self._writer.finish()
         self.check_exists()
+        size = self.size
         self._stream.close()
+        return size
 
     @property
     def size(self) -> int:
         """Bytes given to the file so far; those of the chunk in progress are not among them. 0 once it is closed."""
         return 0 if self._stream.closed else self._stream.tell()
+
+    @property
+    def closed(self) -> bool:
+        """True once it was ended or abandoned."""
+        return self._stream.closed
 
     def abandon(self) -> None:
         """Closes the file without an index after an error; flushed chunks stay readable."""

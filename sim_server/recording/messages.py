@@ -21,7 +21,7 @@ from sim_server.mechanics.world import Body
 from sim_server.mesh import posed
 from sim_server.mesh.surface import surface_triangles
 from sim_server.parameters import LiveParameter, ParameterUpdate
-from sim_server.recording.object_steps import Reactions, Readings, object_step, rows
+from sim_server.recording.object_steps import Additions, Encoded, Reactions, Readings, encoded
 from sim_server.scene import Scene
 from sim_server.scene.solver_options import FACTORS
 from sim_server.simulation import Simulation
@@ -169,24 +169,49 @@ def steps(
     simulation: Simulation, records: NDArray[Any], methods: Callable[[int, int], Method | None] | None = None,
     reactions: Reactions | None = None, readings: Readings | None = None,
 ) -> list[pb.ObjectStep]:  # fmt: skip
+    """Returns the messages of `encoded_steps`."""
+    return [
+        pb.ObjectStep.FromString(step.data) for step in encoded_steps(simulation, records, methods, reactions, readings)
+    ]
+
+
+def encoded_steps(
+    simulation: Simulation, records: NDArray[Any], methods: Callable[[int, int], Method | None] | None = None,
+    reactions: Reactions | None = None, readings: Readings | None = None, excess: Float64 | None = None,
+    age_bound: int = 0, additions: Additions | None = None,
+) -> list[Encoded]:  # fmt: skip
     """Step records (structs.RECORD) as messages.
 
     methods: of body and step, how that factor was made ("auto"). reactions, readings: of the same records
+    excess, age_bound: as of object_steps.encoded. additions: what else the messages have
     """
-    names = [b.name for b in simulation.world.bodies]
-    kinds = preconditioner_names(simulation)
-    known = methods if simulation.scene.solver.preconditioner == "auto" else None
-    found = [
-        object_step(
-            row, names[row["body"]], kinds | _factor_name(known(row["body"], row["factor_step"])) if known else kinds
-        )
-        for row in rows(records)
-    ]
+    bodies, added = simulation.world.bodies, Additions() if additions is None else additions
+    names = [bodies[body].name for body in records["body"].tolist()]
     if reactions is not None:
-        reactions.add_to(found)
+        reactions.add_to(added, records)
     if readings is not None:
-        readings.add_to(found)
-    return found
+        readings.add_to(added, names)
+    data = encoded(records, names, _preconditioners(simulation, records, methods), excess, age_bound)
+    for number, message in added.items():
+        data[number] += message.SerializeToString()
+    return list(map(Encoded, names, records["step"].tolist(), records["time"].tolist(), data))
+
+
+def _preconditioners(
+    simulation: Simulation, records: NDArray[Any], methods: Callable[[int, int], Method | None] | None
+) -> tuple[list[str], list[str]]:
+    """Returns the names of those that solves used and began with."""
+    names = {int(kind): name for kind, name in preconditioner_names(simulation).items()}
+    used, asked = ([names[kind] for kind in records[column].tolist()] for column in ("kind", "asked"))
+    if methods is None or simulation.scene.solver.preconditioner != "auto":
+        return used, asked
+    factor = NAMES[Kind.CHOLESKY]
+    for number, place in enumerate(zip(records["body"].tolist(), records["factor_step"].tolist(), strict=True)):
+        if factor in (used[number], asked[number]) and (method := methods(*place)) is not None:
+            used[number], asked[number] = (
+                method.name if name == factor else name for name in (used[number], asked[number])
+            )
+    return used, asked
 
 
 def reactions(simulation: Simulation, on_obstacles: Float64, others: NDArray[Any]) -> Reactions:
@@ -210,9 +235,5 @@ def preconditioner_names(simulation: Simulation) -> dict[Kind, str]:
     return NAMES | ({Kind.CHOLESKY: wanted} if wanted in FACTORS else {})
 
 
-def _factor_name(method: Method | None) -> dict[Kind, str]:
-    return {} if method is None else {Kind.CHOLESKY: method.name}
-
-
 def _bytes(values: NDArray[Any], dtype: str) -> bytes:
-    return np.ascontiguousarray(values, dtype).tobytes()
+    return np.asarray(values, dtype).tobytes()

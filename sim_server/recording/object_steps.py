@@ -7,7 +7,8 @@ column without a field is not sent. NaN leaves an `optional` field unset.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from functools import lru_cache
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,8 +16,8 @@ from numpy.typing import NDArray
 from protocol import messages_pb2 as pb
 from sim_server.arrays import Float64
 from sim_server.backends.cpu.structs import REACTION_KINDS, RECORD
-from sim_server.backends.kinds import Kind
 from sim_server.backends.measured import Measured
+from sim_server.recording.wire import encode
 
 FIELDS = {  # of ObjectStep by column, where names differ
     "assemble": "assemble_seconds",
@@ -38,6 +39,23 @@ COPIED = {  # field by column, where the value is the same
     if column not in KINDS and (field := FIELDS.get(column, column)) in KNOWN
 }
 OPTIONAL = tuple(field for field in (*COPIED.values(), "dissipated") if KNOWN[field].has_presence)
+
+
+class Encoded(NamedTuple):
+    """Message of a step or a frame of an object, serialized. time: of the simulation after the step [s]"""
+
+    object: str
+    step: int
+    time: float
+    data: bytes
+
+
+class Additions(dict[int, pb.ObjectStep]):
+    """Messages with what the records of some numbers have beside their columns."""
+
+    def __missing__(self, number: int) -> pb.ObjectStep:
+        self[number] = pb.ObjectStep()
+        return self[number]
 
 
 @dataclass(frozen=True)
@@ -63,19 +81,18 @@ class Reactions:
         """Returns the same of some of the records. of: a slice, or numbers of records."""
         return Reactions(self.on_obstacles[of], self.others, self.obstacles, self.bodies)
 
-    def add_to(self, steps: Sequence[pb.ObjectStep]) -> None:
-        """Adds to the steps of the records what their objects exert."""
-        if not self.any:
-            return
-        for step, each in zip(steps, self.on_obstacles, strict=True):
-            add_reactions(step, each, self.obstacles)
+    def add_to(self, steps: Mapping[int, pb.ObjectStep], records: NDArray[Any]) -> None:
+        """Adds to the messages of the records what their objects exert. steps: by the number of the record"""
+        for number in np.flatnonzero(self.on_obstacles.any(axis=(1, 2))).tolist():
+            add_reactions(steps[number], self.on_obstacles[number], self.obstacles)
         if not len(self.others):
             return
-        of = {(step.step, step.header.object): step for step in steps}
+        places = zip(records["step"].tolist(), records["body"].tolist(), strict=True)
+        of = {place: number for number, place in enumerate(places)}
         for other in self.others:
-            found = of.get((int(other["step"]), self.bodies[other["body"]]))
+            found = of.get((int(other["step"]), int(other["body"])))
             if found is not None:
-                self._add(found.reactions.add(), other)
+                self._add(steps[found].reactions.add(), other)
 
     def _add(self, message: pb.Reaction, other: np.void) -> None:
         if other["kind"] == REACTION_KINDS["ON_GRAB"]:
@@ -101,39 +118,48 @@ class Readings:
         """Returns the same of some of the records. of: a slice, or numbers of records."""
         return Readings(self.values[of], self.measured)
 
-    def add_to(self, steps: Sequence[pb.ObjectStep]) -> None:
-        """Adds them to the steps of the records."""
+    def add_to(self, steps: Mapping[int, pb.ObjectStep], names: Sequence[str]) -> None:
+        """Adds them to the messages of the records. steps: by the number of the record; names: of their objects"""
         if not self.measured:
             return
-        for step, values in zip(steps, self.values.tolist(), strict=True):
-            for m, value in zip(self.measured.get(step.header.object, ()), values, strict=False):
-                step.readings.add(of=m.of, quantity=m.quantity, unit=m.unit, value=value)
+        for number, (name, values) in enumerate(zip(names, self.values.tolist(), strict=True)):
+            for m, value in zip(self.measured.get(name, ()), values, strict=False):
+                steps[number].readings.add(of=m.of, quantity=m.quantity, unit=m.unit, value=value)
 
 
-def rows(records: NDArray[Any]) -> list[dict[str, Any]]:
-    """Step records (structs.RECORD) as dictionaries of Python numbers."""
-    names = records.dtype.names or ()
-    columns = [records[name].tolist() for name in names]
-    return [dict(zip(names, row, strict=True)) for row in zip(*columns, strict=True)]
+def encoded(
+    records: NDArray[Any], names: Sequence[str], kinds: Sequence[Sequence[str]], excess: Float64 | None = None,
+    age_bound: int = 0,
+) -> list[bytes]:  # fmt: skip
+    """Serializes the messages of records (structs.RECORD), but for reactions, readings and interactions.
+
+    names: of their objects. kinds: names of the preconditioners that solves used, and of those that they began with
+    excess: (records,) of the scheduler, and the age that factors are to have at most; 0 without them
+    """
+    common = list(zip(names, *kinds, strict=True))
+    numbers = {each: k for k, each in enumerate(dict.fromkeys(common))}
+    prefixes = [_prefix(*each) for each in numbers]
+    number = np.fromiter(map(numbers.__getitem__, common), np.int64, len(common))
+    columns: dict[str, NDArray[Any]] = {field: records[column] for column, field in COPIED.items()}
+    one = records["nonlinear"] == -1  # no Newton-Raphson
+    columns["linearizations"] = np.where(one, 0, records["linearizations"])
+    columns["nonlinear_residual"] = np.where(one, 0.0, records["nonlinear"])
+    with np.errstate(all="ignore"):  # a body that blew up
+        columns["dissipated"] = records["budget"] - records["kinetic"] - records["elastic"]
+    made = records["factor_step"]
+    columns["factor_age"] = np.where(made >= 0, records["step"] - 1 - made, -1)
+    columns["factor_age_bound"] = np.full(len(records), age_bound, np.int64)
+    if excess is not None:
+        columns["excess"] = excess
+    return encode(KNOWN, columns, prefixes, number)
 
 
-def object_step(record: dict[str, Any], name: str, kinds: dict[Kind, str]) -> pb.ObjectStep:
-    """Makes the message of one record, but for reactions. name: of the object. kinds: names of preconditioners."""
-    made, kind, asked = record["factor_step"], record["kind"], record["asked"]
-    values = {field: record[column] for column, field in COPIED.items()}
-    values["dissipated"] = record["budget"] - record["kinetic"] - record["elastic"]
-    for field in OPTIONAL:
-        if values[field] != values[field]:
-            del values[field]
-    if record["nonlinear"] == -1:  # no Newton-Raphson
-        values["linearizations"] = values["nonlinear_residual"] = 0
-    return pb.ObjectStep(
-        header=pb.Header(object=name, epoch=1),
-        factor_age=record["step"] - 1 - made if made >= 0 else -1,
-        preconditioner=kinds[Kind(kind)],
-        asked=kinds[Kind(asked)] if asked != kind else "",
-        **values,
-    )
+@lru_cache(1 << 16)
+def _prefix(name: str, used: str, asked: str) -> bytes:
+    """Returns what messages of an object have in common, serialized."""
+    header = pb.Header(object=name, epoch=1)
+    step = pb.ObjectStep(header=header, preconditioner=used, asked=asked if asked != used else "")
+    return step.SerializeToString()
 
 
 def add_reactions(step: pb.ObjectStep, reactions: Float64, obstacles: Sequence[str]) -> None:

@@ -4,14 +4,12 @@
 from __future__ import annotations
 
 import contextlib
-import os
 import secrets
 import shutil
-import stat
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 from google.protobuf.message import Message
 
@@ -23,8 +21,7 @@ from sim_server.recording.rotation import Kept, Rotation, remove_earlier
 ROOM = 2 << 20  # bytes free beside what each file begins with, for a new file after the disk was full
 
 
-@dataclass(frozen=True)
-class Record:
+class Record(NamedTuple):
     """A message to be written. Times in ns.
 
     repeat: place of what each file begins with, as the newest mesh of an object; empty: it is in one file only
@@ -65,7 +62,7 @@ class Pieces:
         self._run, self._number = secrets.token_hex(8), 1
         self._kept, self.repeated = Kept(rotation), Repeated()
         self._file = McapFile(path, compression, overwrite, self._origin(0))
-        self._regular = path.exists() and stat.S_ISREG(os.stat(path).st_mode)
+        self._regular = self._file.regular
         if self._regular:
             remove_earlier(path)
         self._begun, self._records = time.monotonic(), 0
@@ -101,7 +98,7 @@ class Pieces:
     def look(self, notes: dict[str, int]) -> None:
         """Checks that the file is still there, begins a new one if it is due, keeps the budget. notes: as `finish`"""
         self._file.check_exists()
-        if self._records and self._rotation.due(self._file.size, time.monotonic() - self._begun):
+        if self._regular and self._records and self._rotation.due(self._file.size, time.monotonic() - self._begun):
             self.finish(notes)
             self._kept.add(self.path, self._file_size)
             self._begin(self.repeated.records(), repeats=True)
@@ -110,13 +107,14 @@ class Pieces:
     def finish(self, notes: dict[str, int]) -> None:
         """Ends the file. notes: counts over all files so far; each file has its own part"""
         own = {name: count - self._noted.get(name, 0) for name, count in notes.items()}
+        self._file_size = self._file.finish({name: str(count) for name, count in own.items()})
         self._noted = dict(notes)
-        self._file.finish({name: str(count) for name, count in own.items()})
-        self._file_size = self.path.stat().st_size if self._regular else 0
         self._ended_bytes += self._file_size
 
     def abandon(self) -> None:
-        """Leaves a file that cannot be written; what was flushed stays readable."""
+        """Leaves a file that cannot be written; what was flushed stays readable. One that was ended stays as it is."""
+        if self._file.closed:
+            return
         size = self._file.size
         self._file.abandon()
         self._ended_bytes += size

@@ -12,7 +12,8 @@ import math
 import threading
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Literal
 
@@ -20,6 +21,7 @@ from google.protobuf.message import Message
 
 from protocol import messages_pb2 as pb
 from sim_server.errors import InputError
+from sim_server.recording.object_steps import Encoded
 from sim_server.recording.pieces import Pieces, Record
 from sim_server.recording.rotation import Rotation
 
@@ -28,6 +30,8 @@ LOOK_SECONDS = 0.5  # between two looks whether the file is still there, and whe
 LONGEST_PAUSE = 30.0  # between two attempts to begin a new file, if there is room and it fails all the same
 FRAME_BYTES = 64 << 20  # of all records that wait for the disk; above it frames are dropped
 TOTAL_BYTES = 256 << 20  # the same; above it all records are lost
+
+SEQUENCE = 0xFFFFFFFF  # bits of a number in MCAP files
 
 Compression = Literal["lz4", "zstd", "none"]
 
@@ -115,6 +119,24 @@ class Recorder:
     def step(self, message: pb.ObjectStep, block: bool = False) -> None:
         self._append(f"/step/{message.header.object}", message, self._stamp(message.time), message.step, block)
 
+    def steps(self, steps: Sequence[Encoded], block: bool = False) -> None:
+        """Appends steps that are serialized already."""
+        self._put_all("step", pb.ObjectStep, steps, block)
+
+    def states(self, states: Sequence[Encoded], block: bool = False) -> None:
+        """Appends frames likewise."""
+        self._put_all("state", pb.State, states, block)
+
+    def _put_all(self, channel: str, kind: type[Message], messages: Sequence[Encoded], block: bool) -> None:
+        now = time.time_ns()
+        self._put(
+            [
+                Record(f"/{channel}/{m.object}", kind, self._stamp(m.time), now, m.step & SEQUENCE, m.data)
+                for m in messages
+            ],
+            block,
+        )
+
     def interaction(self, message: pb.Interaction, time: float, block: bool = False) -> None:
         """Appends a push or grab that took effect at `time` [s of simulation]."""
         self._append(f"/interaction/{message.object}", message, self._stamp(time), message.id, block)
@@ -168,26 +190,35 @@ class Recorder:
     ) -> bool:  # fmt: skip
         """Returns False if there is no room; counts: it is dropped or lost then. True after the end of the log, or
         while it is broken: what each file begins with is kept for the next one."""
-        record = Record(
-            topic, type(message), log_time, time.time_ns(), sequence & 0xFFFFFFFF, message.SerializeToString(), repeat
-        )
-        limit = self._frame_bytes if isinstance(message, pb.State) else self._total_bytes
+        now, number, data = time.time_ns(), sequence & SEQUENCE, message.SerializeToString()
+        return self._put([Record(topic, type(message), log_time, now, number, data, repeat)], block, counts)
+
+    def _put(self, records: Sequence[Record], block: bool, counts: bool = True) -> bool:
+        whole = True
         with self._changed:
-            if block:
-                self._changed.wait_for(lambda: self._fits(record, self._frame_bytes) or self.broken or self._closing)
-            if self._closing:
-                return True
-            if self.broken:
-                self._miss(record)
-                return True
-            if not block and not self._fits(record, limit):
-                if counts:
-                    self._count_dropped(record)
-                return False
-            self._waiting.append(record)
-            self._waiting_bytes += len(record.data)
+            for record in records:
+                if block and not self._may_append(record):
+                    self._changed.notify_all()
+                    self._changed.wait_for(partial(self._may_append, record))
+                if self._closing:
+                    break
+                if self.broken:
+                    self._miss(record)
+                elif not self._fits(record, self._limit(record)):
+                    whole = False
+                    if counts:
+                        self._count_dropped(record)
+                else:
+                    self._waiting.append(record)
+                    self._waiting_bytes += len(record.data)
             self._changed.notify_all()
-            return True
+        return whole
+
+    def _limit(self, record: Record) -> int:
+        return self._frame_bytes if record.kind is pb.State else self._total_bytes
+
+    def _may_append(self, record: Record) -> bool:
+        return self._fits(record, self._frame_bytes) or self.broken or self._closing
 
     def _miss(self, record: Record) -> None:
         """Counts a record that came while the log was broken."""

@@ -62,7 +62,7 @@ class ReactionTelemetry:
                 )
                 for r in records[part]
             ]  # fmt: skip
-            reactions[part].add_to(steps)
+            reactions[part].add_to(dict(enumerate(steps)), records[part])
             self._link.publish_reactions(pb.Steps(steps=steps, moves=moves if not first else ()))
 
     def _taken(self) -> list[pb.MoveTaken]:

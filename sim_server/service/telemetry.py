@@ -14,21 +14,24 @@ from protocol import messages_pb2 as pb
 from protocol.method import Method
 from sim_server.arrays import Float64
 from sim_server.backends.kinds import SLACK_OF_ENERGY
+from sim_server.backends.ring_buffers import as_bytes
 from sim_server.checkpoint.file import Checkpoint
 from sim_server.mechanics.named_points import NamedPoints
 from sim_server.mechanics.world import Body, World
 from sim_server.network.link import ServerLink
 from sim_server.parameters import ParameterUpdate
 from sim_server.recording import messages
-from sim_server.recording.object_steps import Reactions, Readings
+from sim_server.recording.object_steps import Additions, Encoded, Reactions, Readings
 from sim_server.recording.obstacles import pose_messages
 from sim_server.recording.recorder import Recorder
 from sim_server.recording.replay_recorder import ReplayRecorder
+from sim_server.recording.wire import repeated
 from sim_server.service.commands import Commands
 from sim_server.service.contact_telemetry import ContactTelemetry
 from sim_server.service.cuts import CutTelemetry
 from sim_server.service.event_counts import EventCounts
 from sim_server.service.reaction_telemetry import ReactionTelemetry
+from sim_server.service.unsent_steps import UnsentSteps
 from sim_server.simulation import Simulation
 from sim_server.updates.driver import Driver
 
@@ -74,19 +77,19 @@ class Telemetry:
         self.replay_recorder = ReplayRecorder(driver, link, recorder) if recorder and commands else None
         self.started = time.monotonic()
         self.record_every = self.simulation.scene.record.every if recorder else 0
-        self._batch: deque[pb.ObjectStep] = deque(maxlen=MAX_BATCH)
-        self._window: list[deque[int]] = [
-            deque(maxlen=STATISTICS_STEPS) for _ in self.simulation.world.bodies
-        ]  # iterations
+        self._unsent = UnsentSteps(MAX_BATCH)
+        bodies = len(self.simulation.world.bodies)
+        self._window = np.zeros((bodies, STATISTICS_STEPS), np.int32)  # iterations of the last steps
+        self._told = np.zeros(bodies, np.int64)  # steps of each body
         self.seconds: deque[float] = deque(maxlen=STATISTICS_STEPS)
-        self._last: NDArray[Any] = np.zeros(len(self._window), self.engine.records_dtype)
+        self._last: NDArray[Any] = np.zeros(bodies, self.engine.records_dtype)
         self._last_reactions: dict[int, tuple[Reactions, int]] = {}  # by body, and the number of its record in them
         self._last_readings: dict[int, Readings] = {}  # by body, one record
         self._not_finite: set[str] = set()  # objects of which it was said
         self.solves = 0
         self.pace = ""  # why the run does not keep pace with the clock; empty: it does, or need not
         self.unconverged: Counter[str] = Counter()  # solves by status, of those that did not converge
-        self._energy: dict[int, float] = {}  # by body, kinetic + elastic + gravity of the last step with all three [J]
+        self._energy = np.full(bodies, np.nan)  # by body, of the last step with all of kinetic, elastic and gravity [J]
         self.runaways: Counter[int] = Counter()  # steps by body
         self.events = EventCounts()
         self._halved: set[int] = set()  # bodies of which it was said
@@ -96,6 +99,7 @@ class Telemetry:
         self._due = {"steps": 0.0, "state": 0.0, "status": 0.0, "look": 0.0}
         self._has_viewers = False
         self._interactions: dict[int, pb.Interaction] = {}
+        self._over: set[int] = set()  # ids of those of them that act no more
         self._points: list[NamedPoints] = []
         self._stale_moduli: set[str] = set()  # keys of parameters that were set
         self.simulation.parameters.on_set.append(self._on_set)
@@ -143,27 +147,31 @@ class Telemetry:
             self.seconds.extend(records["whole"][records["body"] == 0].tolist())
             self.update_summary(records, reactions, readings)
             self.reactions.publish(records, reactions)
-            steps = self._messages(records, reactions, readings)
-            self._add_interactions(steps)
+            self._note_interactions()
             if self.recorder:
-                for step in steps:
-                    self.recorder.step(step, block=self.patient)
-            self._batch.extend(steps)
-        if self._is_due("steps", STEPS_PERIOD) and self._batch:
+                self.recorder.steps(self._encoded(records, reactions, readings), block=self.patient)
             if self.link.wants_steps():
-                self.link.publish_steps(pb.Steps(steps=self._batch))
-            self._batch.clear()
+                self._unsent.add(records, reactions, readings)
+        if self._is_due("steps", STEPS_PERIOD):
+            batches, left_out = self._unsent.take()
+            if batches and self.link.wants_steps():
+                steps = [step.data for each in batches for step in self._encoded(*each)]
+                sent = pb.Steps.FromString(repeated(pb.Steps.STEPS_FIELD_NUMBER, steps))
+                sent.left_out = left_out
+                self.link.publish_steps(sent)
+            self._forget_interactions()
 
     def update_summary(
         self, records: NDArray[Any], reactions: Reactions | None = None, readings: Readings | None = None
     ) -> None:
         """Keeps what the status tells of steps: records, reactions and readings, iterations and energies."""
         order = np.argsort(records["body"], kind="stable")
-        present, first = np.unique(records["body"][order], return_index=True)
-        iterations = records["iterations"][order].tolist()
-        ends = [*first[1:].tolist(), len(order)]
-        newest = order[np.array(ends) - 1]
-        self._last[present] = records[newest]
+        present, first, counts = np.unique(records["body"][order], return_index=True, return_counts=True)
+        at = self._told[present].repeat(counts) + np.arange(len(order)) - first.repeat(counts)
+        self._window[present.repeat(counts), at % STATISTICS_STEPS] = records["iterations"][order]
+        self._told[present] += counts
+        newest = order[first + counts - 1]
+        as_bytes(self._last)[present] = as_bytes(records)[newest]
         self.events.add(records)
         if reactions is not None and reactions.any:
             for body, record in zip(present.tolist(), newest.tolist(), strict=True):
@@ -171,59 +179,73 @@ class Telemetry:
         if readings is not None and readings.measured:
             for body, record in zip(present.tolist(), newest.tolist(), strict=True):
                 self._last_readings[body] = readings[record : record + 1]
-        for body, begin, end in zip(present.tolist(), first.tolist(), ends, strict=True):
-            self._window[body].extend(iterations[begin:end])
-        for r in records[np.isfinite(records["elastic"])]:
-            self._energy[int(r["body"])] = float(r["kinetic"] + r["elastic"] + r["gravity"])
+        with np.errstate(all="ignore"):  # a body that blew up
+            energy = records["kinetic"] + records["elastic"] + records["gravity"]
+        evaluated = np.flatnonzero(np.isfinite(records["elastic"]))
+        self._energy[records["body"][evaluated]] = energy[evaluated]
 
-    def _messages(
+    def _encoded(
         self, records: NDArray[Any], reactions: Reactions, readings: Readings | None
-    ) -> list[pb.ObjectStep]:  # fmt: skip
+    ) -> list[Encoded]:  # fmt: skip
         """Makes messages for the log and for subscribers only: it is the most expensive part of telemetry."""
-        most = len(records) if self.recorder else MAX_BATCH if self.link.wants_steps() else 0
-        wanted = slice(max(len(records) - most, 0), None)
-        told = None if readings is None else readings[wanted]
-        steps = messages.steps(self.simulation, records[wanted], self._method, reactions[wanted], told)
-        bound = self.driver.age_bound() if steps else -1
-        for step in steps:
-            step.excess = self.driver.by_name[step.header.object].solves.excess
-            step.factor_age_bound = bound
-        return steps
+        excess = np.array([state.solves.excess for state in self.driver.bodies])[records["body"]]
+        additions = self._acting(records)
+        return messages.encoded_steps(
+            self.simulation, records, self._method, reactions, readings, excess, self.driver.age_bound(), additions
+        )
 
     def _method(self, body: int, step: int) -> Method | None:
         """Returns how the factor of a step was made."""
         return self.driver.bodies[body].factors.method(step)
 
-    def _latest(self, body: int, bound: int) -> pb.ObjectStep | None:
-        if not self._window[body]:
-            return None
-        reactions, at = self._last_reactions.get(body, (None, 0))
-        own = None if reactions is None else reactions[at : at + 1]
-        record, told = self._last[body : body + 1], self._last_readings.get(body)
-        message = messages.steps(self.simulation, record, self._method, own, told)[0]
-        message.excess, message.factor_age_bound = self.driver.bodies[body].solves.excess, bound
-        return message
+    def _latest(self, bound: int) -> dict[int, pb.ObjectStep]:
+        """Returns the last steps by body. bound: age that factors are to have at most"""
+        bodies, additions = np.flatnonzero(self._told), Additions()
+        records = self._last[bodies]
+        for number, body in enumerate(bodies.tolist()):
+            own, record = Additions(), records[number : number + 1]
+            if body in self._last_reactions:
+                reactions, at = self._last_reactions[body]
+                reactions[at : at + 1].add_to(own, record)
+            if body in self._last_readings:
+                self._last_readings[body].add_to(own, [self.simulation.world.bodies[body].name])
+            if own:
+                additions[number] = own[0]
+        excess = np.array([self.driver.bodies[body].solves.excess for body in bodies.tolist()])
+        steps = messages.encoded_steps(
+            self.simulation, records, self._method, excess=excess, age_bound=bound, additions=additions
+        )
+        return {body: pb.ObjectStep.FromString(s.data) for body, s in zip(bodies.tolist(), steps, strict=True)}
 
-    def _add_interactions(self, steps: list[pb.ObjectStep]) -> None:
-        """Adds to each step record the interactions that acted in it."""
+    def _note_interactions(self) -> None:
+        """Takes note of the interactions that act in steps, of which messages tell."""
         if self.commands is None or self.simulation.touch is None:
             return
         known = {i.id: i for i in self.commands.interactions()}
         clock, dt = float(self.simulation.system.clock[0]), self.simulation.world.dt
-        for id in set(self._interactions) - set(known):  # over or released: it acted up to the step under way at most
-            self._interactions[id].duration = min(
-                self._interactions[id].duration, max(clock + dt - self._interactions[id].start, 0)
-            )
+        for id in set(self._interactions) - set(known) - self._over:  # it acted up to the step under way at most
+            interaction = self._interactions[id]
+            interaction.duration = min(interaction.duration, max(clock + dt - interaction.start, 0))
+            self._over.add(id)
         self._interactions.update(known)
-        of: dict[str, list[pb.Interaction]] = {}
-        for i in self._interactions.values():
-            of.setdefault(i.object, []).append(i)
-        for step in steps:
-            begin = step.time - dt
-            mine = of.get(step.header.object, ())
-            step.interactions.extend(i for i in mine if 0 <= i.start <= begin + 0.5 * dt < i.start + i.duration)
-        for id in set(self._interactions) - set(known):
+
+    def _forget_interactions(self) -> None:
+        """Forgets those that are over: the messages of steps in which they acted are made."""
+        for id in self._over:
             del self._interactions[id]
+        self._over.clear()
+
+    def _acting(self, records: NDArray[Any]) -> Additions:
+        """Returns the interactions that acted in the steps of records."""
+        additions, dt = Additions(), self.simulation.world.dt
+        bodies = {body.name: body.index for body in self.simulation.world.bodies} if self._interactions else {}
+        begin = records["time"] - dt
+        for i in self._interactions.values():
+            acted = (i.start <= begin + 0.5 * dt) & (begin + 0.5 * dt < i.start + i.duration)
+            if i.start >= 0:
+                for number in np.flatnonzero(acted & (records["body"] == bodies.get(i.object, -1))).tolist():
+                    additions[number].interactions.append(i)
+        return additions
 
     def frames(self) -> None:
         """Sends states and poses of obstacles, to the log at the scene's rate, the newest ones to viewers."""
@@ -239,7 +261,7 @@ class Telemetry:
             self.contact.publish_poses(step, self.engine.frame_poses[step])
 
     def _publish_frame(self, step: int, x: Float64, v: Float64, shown: int | None = None) -> None:
-        for body in self.simulation.world.bodies:
+        for body in self.simulation.world.bodies if self.link.wants_state() else ():
             if self.link.wants_state(body.name):
                 self.link.publish_state(self._state(body, step, x, v, shown))
 
@@ -289,11 +311,14 @@ class Telemetry:
 
     def _record_frame(self, step: int, x: Float64, v: Float64, poses: Float64 | None = None) -> None:
         assert self.recorder is not None
+        time, states = step * self.simulation.world.dt, []
         for body in self.simulation.world.bodies:
             if self.cuts.written(body.name, step):
-                self.recorder.state(self._state(body, step, x, v), block=self.patient)
+                data = self._state(body, step, x, v).SerializeToString()
+                states.append(Encoded(body.name, step, time, data))
             else:
                 self.recorder.skip_frame()
+        self.recorder.states(states, block=self.patient)
         self.contact.record_poses(step, poses, block=self.patient)
 
     def _on_set(self, update: ParameterUpdate) -> None:
@@ -328,15 +353,17 @@ class Telemetry:
         status.records_lost = self.recorder.lost if self.recorder else 0
         status.recording_failure = self.recorder.failure[:400] if self.recorder else ""
         bound = self.driver.age_bound()
+        latest = self._latest(bound)
+        means = self._window.sum(axis=1) / np.clip(self._told, 1, STATISTICS_STEPS)
         for updates in self.driver.bodies:
-            body, window = updates.body, self._window[updates.body.index]
+            body = updates.body
             status.objects.append(
                 pb.ObjectStatus(
                     object=body.name,
                     nodes=body.last - body.first,
                     tets=len(body.mesh.tets) - self.cuts.removed.get(body.name, 0),
-                    last=self._latest(body.index, bound),
-                    mean_iterations=float(np.mean(window)) if window else 0.0,
+                    last=latest.get(body.index),
+                    mean_iterations=float(means[body.index]),
                     excess=updates.solves.excess,
                     factors_used=updates.factors.used,
                     factors_refused=updates.failures.refused,
@@ -347,7 +374,7 @@ class Telemetry:
                     factor_age_max=updates.solves.max_factor_age,
                     factor_age_bound=bound,
                     runaway_steps=self.runaways[body.index],
-                    total_energy=self._energy.get(body.index),
+                    total_energy=None if np.isnan(energy := self._energy[body.index]) else float(energy),
                     clipped=self.contact.clipped[body.index],
                     crowded=self.contact.crowded[body.index],
                     events=self.events.of(body.index),

@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: MIT
 """What is known of the updates of one body: its solves, the job in flight, failures and factors."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
@@ -13,8 +12,8 @@ from protocol.method import Method
 from sim_server.backends.rosenbrock import FORMS
 from sim_server.mechanics.world import Body
 from sim_server.updates.autotune.preconditioner import PreconditionerTuner
-from sim_server.updates.scheduler import UpdateRequest
 from sim_server.updates.stats import MEMORY, RunningMean, flops
+from sim_server.updates.update_table import NONE, Cell, MeanCell, UpdateTable
 
 MAX_REMEMBERED = 32  # factors whose method and worker are remembered
 ONE_SOLVE, FACTOR = FORMS["ONE_SOLVE"], FORMS["FACTOR"]
@@ -22,32 +21,42 @@ STAGES = 2  # linear solves of a step of the other forms
 MIN_SECONDS = 1e-6  # s; a factorization is never taken to be faster
 
 
-@dataclass(slots=True)
 class SolveStatistics:
-    """Sums over the solves of a body; excess is the number of iterations above the floor."""
+    """Sums over the solves of a body; excess is the number of iterations above the floor.
 
-    excess: float = 0.0  # since the last matrix was sent, or its factor taken up
-    latest: float = 0.0  # excess of the last solve
-    lost: float = 0.0  # excess of the solves with the factor in use
-    factor_step: int = -1  # of the factor in use
-    max_factor_age: int = -1  # steps; -1: no factor was used
-    iteration_cost: RunningMean = field(default_factory=RunningMean)  # s, or bytes
-    first_excess: RunningMean = field(default_factory=RunningMean)  # of the first solve with a new factor
+    excess: since the last matrix was sent, or its factor taken up
+    latest: excess of the last solve
+    lost: excess of the solves with the factor in use
+    factor_step: of the factor in use
+    max_factor_age: steps; -1: no factor was used
+    iteration_cost: s, or bytes
+    first_excess: of the first solve with a new factor
+    """
 
-    def add(self, excess: float, factor_step: int, newest: int) -> None:
-        """Adds a solve.
+    excess, latest, lost, factor_step, max_factor_age = Cell(), Cell(), Cell(), Cell(), Cell()
 
-        factor_step: of its factor, -1: it had none
+    def __init__(self, table: UpdateTable, index: int):
+        self._table, self._index = table, index
+        self.iteration_cost = MeanCell(table.iteration_cost, index)
+        self.first_excess = RunningMean()
+
+    def add(self, excess: Iterable[float], factor_steps: Iterable[int], newest: int) -> None:
+        """Adds solves, one after another.
+
+        factor_steps: of their factors, -1: it had none
         newest: step of the newest factor that was taken up
         """
-        if 0 <= factor_step < newest:  # made before the newest factor was taken up
-            return
-        if factor_step >= 0:
-            if factor_step != self.factor_step:
-                self.factor_step, self.lost, self.excess = factor_step, 0.0, 0.0
-                self.first_excess.add(excess)
-            self.lost += excess
-        self.excess, self.latest = self.excess + excess, float(excess)
+        total, latest, lost, last = self.excess, self.latest, self.lost, self.factor_step
+        for each, step in zip(excess, factor_steps, strict=True):
+            if 0 <= step < newest:  # made before the newest factor was taken up
+                continue
+            if step >= 0:
+                if step != last:
+                    last, lost, total = step, 0.0, 0.0
+                    self.first_excess.add(each)
+                lost += each
+            total, latest = total + each, each
+        self.excess, self.latest, self.lost, self.factor_step = total, latest, lost, last
 
     def restart(self) -> None:
         """A new factor was taken up: what is known of the solves so far is of another one."""
@@ -55,45 +64,94 @@ class SolveStatistics:
         self.excess = self.latest = self.first_excess.value or 0.0
 
 
-@dataclass(slots=True)
 class JobState:
-    """The matrix that is being copied or factorized."""
+    """The matrix that is being copied or factorized.
 
-    copy: NDArray[np.float64] | None = None  # into which the loop copies the matrix or the positions requested
-    request: int = 0  # number of the request for that copy, among those of all bodies
-    extrapolated: float = 0.0  # s; by how much the positions requested were extrapolated
-    in_flight: bool = False
-    sent: int | None = None  # step of the last matrix that was sent; None: none was
-    matrix: tuple[int, NDArray[np.float64]] | None = None  # of the job in flight: step and what was sent
-    positions: bool = False  # the last job held positions, from which the worker assembles the matrix
-    excess: float = 0.0  # of the body when the last matrix was sent: to be restored if the job fails
+    copy: into which the loop copies the matrix or the positions requested
+    request: number of the request for that copy, among those of all bodies
+    extrapolated: by how much the positions requested were extrapolated [s]
+    sent: step of the last matrix that was sent; None: none was
+    matrix: of the job in flight: step and what was sent
+    positions: the last job held positions, from which the worker assembles the matrix
+    excess: of the body when the last matrix was sent: to be restored if the job fails
+    """
+
+    in_flight = Cell()
+
+    def __init__(self, table: UpdateTable, index: int):
+        self._table, self._index = table, index
+        self._copy: NDArray[np.float64] | None = None
+        self.request, self.extrapolated, self.excess = 0, 0.0, 0.0
+        self.matrix: tuple[int, NDArray[np.float64]] | None = None
+        self.positions = False
+
+    @property
+    def copy(self) -> NDArray[np.float64] | None:
+        return self._copy
+
+    @copy.setter
+    def copy(self, copy: NDArray[np.float64] | None) -> None:
+        self._copy, self._table.copying[self._index] = copy, copy is not None
+
+    @property
+    def sent(self) -> int | None:
+        step = int(self._table.sent[self._index])
+        return None if step == NONE else step
+
+    @sent.setter
+    def sent(self, step: int | None) -> None:
+        self._table.sent[self._index] = NONE if step is None else step
 
 
-@dataclass(slots=True)
 class FailureState:
-    """Jobs and factors that were of no use."""
+    """Jobs and factors that were of no use.
 
-    in_a_row: int = 0  # jobs without a factor that is used
-    assemblies: int = 0  # jobs in a row with positions that brought no factor
-    refused: int = 0  # factors, and solves that abandoned theirs
-    reason: str = ""  # of the last one
-    reported: set[str] = field(default_factory=set)  # causes that the log has
+    in_a_row: jobs without a factor that is used
+    assemblies: jobs in a row with positions that brought no factor
+    refused: factors, and solves that abandoned theirs
+    reason: of the last one
+    reported: causes that the log has
+    """
+
+    in_a_row, refused = Cell("failures"), Cell()
+
+    def __init__(self, table: UpdateTable, index: int):
+        self._table, self._index = table, index
+        self.assemblies, self.reason = 0, ""
+        self.reported: set[str] = set()
 
 
-@dataclass(slots=True)
 class FactorStatistics:
-    """Factors that were taken up."""
+    """Factors that were taken up.
 
-    used: int = 0
-    regularized: int = 0  # of these, made from a matrix that was not positive definite
-    newest: int = -1  # step of the matrix of the newest factor
-    kept: Factor | None = None  # the newest one, under policies by which a run repeats
-    dropped: tuple[int, int] | None = None  # the newest factor is useless: its step, kind of the solves until then
-    latency: RunningMean = field(default_factory=RunningMean)  # steps from a matrix to its factor
-    cost: RunningMean = field(default_factory=RunningMean)  # s, or operations, of a factorization
-    cost_by_method: dict[str, RunningMean] = field(default_factory=dict)
-    methods: dict[int, Method] = field(default_factory=dict)  # of the last jobs, by step
-    workers: dict[int, str] = field(default_factory=dict)  # of the last factors, by step
+    used: how many; regularized: of these, made from a matrix that was not positive definite
+    newest: step of the matrix of the newest factor
+    kept: the newest one, under policies by which a run repeats
+    latency: steps from a matrix to its factor
+    cost, cost_by_method: of a factorization [s, or operations]
+    methods, workers: of the last jobs, and of the last factors, by step
+    """
+
+    newest, used = Cell(), Cell()
+
+    def __init__(self, table: UpdateTable, index: int):
+        self._table, self._index = table, index
+        self.regularized = 0
+        self.kept: Factor | None = None
+        self._dropped: tuple[int, int] | None = None
+        self.latency, self.cost = MeanCell(table.latency, index), MeanCell(table.cost, index)
+        self.cost_by_method: dict[str, RunningMean] = {}
+        self.methods: dict[int, Method] = {}
+        self.workers: dict[int, str] = {}
+
+    @property
+    def dropped(self) -> tuple[int, int] | None:
+        """The newest factor is useless: its step, kind of the solves until then."""
+        return self._dropped
+
+    @dropped.setter
+    def dropped(self, dropped: tuple[int, int] | None) -> None:
+        self._dropped, self._table.dropped[self._index] = dropped, dropped is not None
 
     def age(self, step: int) -> int:
         """Returns the steps since the matrix of the newest factor, -1 without one."""
@@ -130,33 +188,23 @@ class BodyUpdateState:
     error_bound: largest estimate of the error of a step that is not made again [m]
     counted: costs are bytes and operations instead of seconds, so that runs repeat exactly. A byte counts like an
         operation, which is about what a core makes of them.
+    table: of all bodies, with a row for this one; None: one of its own
     """
 
-    def __init__(self, body: Body, methods: Sequence[Method] = (), counted: bool = False, error_bound: float = np.inf):
+    frozen = Cell()  # it has run away and moves no more: needs no factors
+
+    def __init__(
+        self, body: Body, methods: Sequence[Method] = (), counted: bool = False, error_bound: float = np.inf,
+        table: UpdateTable | None = None,
+    ):  # fmt: skip
         self.body, self.counted, self.error_bound = body, counted, error_bound
-        self.frozen = False  # it has run away and moves no more: needs no factors
+        self._table, self._index = (UpdateTable(1), 0) if table is None else (table, body.index)
+        row = self._table, self._index
+        self._table.error_bound[self._index] = error_bound
         self.solves, self.job, self.failures, self.factors = (
-            SolveStatistics(), JobState(), FailureState(), FactorStatistics(),
+            SolveStatistics(*row), JobState(*row), FailureState(*row), FactorStatistics(*row),
         )  # fmt: skip
         self.tuner = PreconditionerTuner(methods) if methods else None
-
-    def request(self, step: int) -> UpdateRequest:
-        """Returns what the scheduler is told at a step."""
-        solves, job, factors = self.solves, self.job, self.factors
-        age = factors.age(step)
-        return UpdateRequest(
-            self.body.name,
-            solves.excess,
-            None if job.sent is None else step - job.sent,
-            job.in_flight or job.copy is not None,
-            age if age >= 0 else None,
-            1.0 if solves.iteration_cost.value is None else solves.iteration_cost.value,
-            1.0 if factors.cost.value is None else factors.cost.value,
-            self.failures.in_a_row,
-            solves.lost,
-            self.tuner is not None and self.tuner.wants_factor,
-            solves.latest,
-        )
 
     def on_job(self, step: int, method: Method) -> None:
         """Takes note that the matrix of a step is to be factorized."""
@@ -221,7 +269,7 @@ class BodyUpdateState:
         else:
             solves = max(int(record["linearizations"]), 1) * (1 if form == ONE_SOLVE else STAGES)
             lost = max(iterations - floor * solves, 0)
-        self.solves.add(lost, factor_step, self.factors.newest)
+        self.solves.add([float(lost)], [factor_step], self.factors.newest)
         self.failures.refused += int(record["fallbacks"])
         self.solves.iteration_cost.add(cost / (iterations + 1))
         if factor_step >= 0:
@@ -241,40 +289,30 @@ def excess(records: Any, floor: int, error_bound: Any) -> Any:
     return np.where(alone, np.where(alone, records["estimate"], 0.0) / error_bound, above)
 
 
-def observe_steps(states: Sequence[BodyUpdateState], r: NDArray[Any], floor: int) -> None:
+def observe_steps(states: Sequence[BodyUpdateState], table: UpdateTable, r: NDArray[Any], floor: int) -> None:
     """Takes note of whole steps, as BodyUpdateState.observe does of each record of (steps, bodies), in seconds.
 
-    Each round of the service thread gives a worker one job: with a thousand bodies this function is what it waits for.
+    table: that of the states. Bodies whose factor changed within these steps are looked at one by one.
     """
     steps, factor = len(r), r["factor_step"]
-    above = excess(r, floor, np.array([state.error_bound for state in states]))
+    above = excess(r, floor, table.error_bound)
     weights = (1 - MEMORY) ** np.arange(steps - 1, -1, -1)
     each = r["solve"] / (r["iterations"] + 1)
     costs = weights @ each / weights.sum()
-    rest = float((1 - MEMORY) ** steps)
-    age = np.where(factor >= 0, r["step"] - 1 - factor, -1).max(axis=0)
-    columns = (
-        above.sum(axis=0),
-        above[-1],
-        (factor == factor[0]).all(axis=0),
-        factor[0],
-        costs,
-        r["fallbacks"].sum(axis=0),
-        age,
-    )
-    for k, (state, total, last, one, made, cost, fallbacks, oldest) in enumerate(
-        zip(states, *(column.tolist() for column in columns), strict=True)
-    ):
-        solves, newest = state.solves, state.factors.newest
-        state.failures.refused += fallbacks
-        solves.iteration_cost.add_all(cost, rest, float(each[0, k]))
-        solves.max_factor_age = max(solves.max_factor_age, oldest)
-        if one and (made < 0 or made == solves.factor_step == newest):
-            solves.excess, solves.latest = solves.excess + total, float(last)
-            solves.lost += total if made >= 0 else 0
-            continue
-        for i in range(steps):
-            solves.add(float(above[i, k]), int(factor[i, k]), newest)
+    before = np.where(np.isnan(table.iteration_cost), each[0], table.iteration_cost)
+    table.iteration_cost[:] = costs + (1 - MEMORY) ** steps * (before - costs)
+    table.refused += r["fallbacks"].sum(axis=0)
+    age = np.where(factor >= 0, r["step"] - 1 - factor, NONE).max(axis=0)
+    np.maximum(table.max_factor_age, age, out=table.max_factor_age)
+    made, one = factor[0], (factor == factor[0]).all(axis=0)
+    same = one & ((made < 0) | ((made == table.factor_step) & (made == table.newest)))
+    total = np.where(same, above.sum(axis=0), 0.0)
+    table.excess += total
+    table.lost += np.where(made >= 0, total, 0.0)
+    table.latest[same] = above[-1, same]
+    outdated = one & (made >= 0) & (made < table.newest)  # a newer factor was taken up: these solves count no more
+    for k in np.flatnonzero(~same & ~outdated).tolist():
+        states[k].solves.add(above[:, k].tolist(), factor[:, k].tolist(), states[k].factors.newest)
 
 
 def _remember(table: dict[int, Any], step: int, value: Any) -> None:

@@ -6,6 +6,7 @@
 """
 
 import logging
+import os
 import re
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -27,9 +28,10 @@ from sim_server.updates.factor_check import FactorCheck
 from sim_server.updates.factor_source import FactorSource, Inline, Job
 from sim_server.updates.patterns import Patterns
 from sim_server.updates.policies import make_policy
-from sim_server.updates.scheduler import UpdateRequest
+from sim_server.updates.scheduler import UpdateRequests
 from sim_server.updates.snapshots import SnapshotPool
 from sim_server.updates.solve_observer import SolveObserver
+from sim_server.updates.update_table import NONE, UpdateTable
 from sim_server.updates.useless_factors import UselessFactors
 
 log = logging.getLogger(__name__)
@@ -72,7 +74,9 @@ class Driver:
         self.counted = not self.policy.free if counted is None else counted
         methods = () if alone else self.solver.choices(world.backend.name)
         bounds = simulation.integrator.error_bounds
-        self.bodies = [BodyUpdateState(b, methods, self.counted, bounds[b.index]) for b in world.bodies]
+        self.table = table = UpdateTable(len(world.bodies))
+        self.bodies = [BodyUpdateState(b, methods, self.counted, bounds[b.index], table) for b in world.bodies]
+        self._tuned = bool(methods)
         self.by_name = {s.body.name: s for s in self.bodies}
         self.wants_factors = self.solver.wants_factors
         if self.wants_factors:
@@ -85,8 +89,8 @@ class Driver:
         self.on_epoch: list[Callable[[Body, int], None]] = []  # called before the first job of an epoch of a body
         self.snapshots = SnapshotPool(simulation, self.source, self.policy.expected_latency)
         self.useless_factors = UselessFactors(self)
-        self._checker = ThreadPoolExecutor(1, "checks of factors")
         self.checks: list[FactorUnderCheck] = []  # oldest first
+        self._begin_checks()
         self._observer = SolveObserver(self)
         self._warped = {b.name: b.index in simulation.warped for b in world.bodies}
 
@@ -146,10 +150,19 @@ class Driver:
 
     # --- matrices out -------------------------------------------------------------------------------------------
 
-    def requests(self) -> list[UpdateRequest]:
+    def requests(self) -> UpdateRequests:
         """Returns what the scheduler is told of each body but those that are frozen."""
-        step = self.engine.step
-        return [state.request(step) for state in self.bodies if not state.frozen]
+        t, step = self.table, self.engine.step
+        tuners = [state.tuner for state in self.bodies] if self._tuned else []
+        on_trial = np.array([t is not None and t.wants_factor for t in tuners] or [False] * len(self.bodies))
+        age = np.where((t.newest >= 0) & ~t.dropped, step - t.newest, NONE)
+        iteration_cost, cost = (np.where(np.isnan(each), 1.0, each) for each in (t.iteration_cost, t.cost))
+        waited = np.where(t.sent >= 0, step - t.sent, NONE)
+        every = UpdateRequests(
+            np.arange(len(t)), t.excess, waited, t.in_flight | t.copying, age, iteration_cost, cost, t.failures,
+            t.lost, on_trial, t.latest,
+        )  # fmt: skip
+        return every.of(~t.frozen)
 
     def make_job(self, state: BodyUpdateState) -> Job | None:
         """Returns the job of the copy that the loop has made for a body. None: the copy does not suffice and is
@@ -217,8 +230,16 @@ class Driver:
         matrix = self.snapshots.release(state, factor.step)
         self._take_up(state, factor, self.check.reject_reason(factor, matrix) if is_new else "")
 
+    def _begin_checks(self) -> None:
+        self._checker, self._process = ThreadPoolExecutor(1, "checks of factors"), os.getpid()
+
     def _end_checks(self) -> None:
-        """Takes up the factors whose checks have ended."""
+        """Takes up the factors whose checks have ended. In a process that was forked no thread is at those before."""
+        if self._process != os.getpid():
+            self._begin_checks()
+            lost, self.checks = self.checks, []
+            for check in lost:
+                self.fail(check.factor.object, "its check ended with the process that it was in")
         ended = [each for each in self.checks if each.reason.done()]
         for check in ended:
             self.checks.remove(check)

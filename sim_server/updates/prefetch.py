@@ -5,8 +5,9 @@ The loop copies a matrix as it assembles it, once a step. If only as many were r
 of them would get one job a step: with a thousand small bodies, whose step takes a second, it would rest for most of it.
 """
 
-from collections.abc import Iterable
+import numpy as np
 
+from sim_server.arrays import Float64
 from sim_server.updates.stats import RunningMean
 
 MAX_DEPTH = 256  # matrices held at once
@@ -30,11 +31,11 @@ class PrefetchDepth:
         self._last = step, now
         return True
 
-    def update(self, seconds: Iterable[float | None], workers: int) -> None:
-        """Computes the depth. seconds: of a factorization of each body, None: not known yet."""
-        known = [s for s in seconds if s is not None]
-        if known and self._period.value is not None:
-            service = sum(known) / len(known) + TRANSFER
+    def update(self, seconds: Float64, workers: int) -> None:
+        """Computes the depth. seconds: of a factorization of each body, NaN: not known yet."""
+        known = seconds[~np.isnan(seconds)]
+        if len(known) and self._period.value is not None:
+            service = float(known.mean()) + TRANSFER
             self.depth = min(int(workers * self._period.value / service), MAX_DEPTH)
         else:
             self.depth = 0

@@ -12,119 +12,125 @@ round_robin  the object whose matrix was sent longest ago
 Whatever the rule, an object whose last matrix is `overdue` goes first, so none starves.
 """
 
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, fields
 from math import ceil, inf
+from typing import Any
 
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from sim_server.arrays import Float64, Int64
 from sim_server.scene.solver_options import Rule
+
+Flags = NDArray[np.bool_]
 
 OUTLOOK = 10.0  # steps for which the excess of the last solve is taken to go on
 MAX_DOUBLINGS = 10  # of the least interval between matrices of an object whose jobs fail
 
 
-@dataclass(frozen=True)
-class UpdateRequest:
-    """What the scheduler knows of an object.
+@dataclass(frozen=True, eq=False)
+class UpdateRequests:
+    """What the scheduler knows of some bodies: arrays with an entry for each.
 
+    body: its number
     excess: summed iterations above the floor
-    waited: steps since its last matrix was sent; None: none was yet
+    waited: steps since its last matrix was sent; -1: none was yet
     in_flight: a matrix of it is being copied or factorized
-    age: steps since the matrix of its factor; None: it has no factor
-    iteration_cost, factorization_cost: in any unit, as long as it is the same for all objects
+    age: steps since the matrix of its factor; -1: it has no factor
+    iteration_cost, factorization_cost: in any unit, as long as it is the same for all bodies
     failures: jobs in a row that brought no factor
     lost: summed iterations above the floor of solves with the factor in use
     on_trial: a new factor is wanted for a comparison, whatever was lost
     latest: excess of the last solve
     """
 
-    object: str
-    excess: float
-    waited: int | None
-    in_flight: bool
-    age: int | None = None
-    iteration_cost: float = 1.0
-    factorization_cost: float = 1.0
-    failures: int = 0
-    lost: float = 0.0
-    on_trial: bool = False
-    latest: float = 0.0
+    body: Int64
+    excess: Float64
+    waited: Int64
+    in_flight: Flags
+    age: Int64
+    iteration_cost: Float64
+    factorization_cost: Float64
+    failures: Int64
+    lost: Float64
+    on_trial: Flags
+    latest: Float64
+
+    def __len__(self) -> int:
+        return len(self.body)
+
+    def of(self, chosen: Any) -> "UpdateRequests":
+        """Returns the requests that an index or a mask chooses."""
+        return UpdateRequests(*(getattr(self, field.name)[chosen] for field in fields(self)))
 
 
-def expected_excess(request: UpdateRequest) -> float:
-    """Returns the sum of an object as it will be OUTLOOK steps from now if the excess of the last solve goes on."""
-    return request.excess + OUTLOOK * request.latest
+def expected_excess(requests: UpdateRequests) -> Float64:
+    """Returns the sums of bodies as they will be OUTLOOK steps from now if the excess of the last solve goes on."""
+    return requests.excess + OUTLOOK * requests.latest
 
 
-def is_worthwhile(request: UpdateRequest, threshold: float = 1.0) -> bool:
-    """True if a new factor is worth its time now (the policy `adaptive`).
+def is_worthwhile(requests: UpdateRequests, threshold: float = 1.0) -> Flags:
+    """True where a new factor is worth its time now (the policy `adaptive`).
 
     It is once the iterations lost to the factor in use have cost `threshold` times a factorization. Where they grow
     steadily with its age, by a in each step at a cost of c, that is the best there is: a factor of cost F each T steps
-    makes F / T + a c T / 2 a step, least where a c T^2 / 2, what was lost, is F. An object without a factor, or with
+    makes F / T + a c T / 2 a step, least where a c T^2 / 2, what was lost, is F. A body without a factor, or with
     one to be tried out, does not wait. The two costs must be in the same unit here.
     """
-    lost = request.lost * request.iteration_cost
-    return request.age is None or request.on_trial or lost >= threshold * request.factorization_cost
+    lost = requests.lost * requests.iteration_cost
+    return (requests.age < 0) | requests.on_trial | (lost >= threshold * requests.factorization_cost)
 
 
-_PRIORITY: dict[Rule, Callable[[UpdateRequest], float]] = {
+_PRIORITY: dict[Rule, Callable[[UpdateRequests], NDArray[Any]]] = {
     "excess": expected_excess,
-    "round_robin": lambda request: request.waited or 0,
+    "round_robin": lambda requests: requests.waited,
 }
 
 
 def pick(
-    requests: Iterable[UpdateRequest],
+    requests: UpdateRequests,
     places: int,
     min_interval: int = 1,
     rule: Rule = "excess",
     overdue: float = inf,
-) -> list[str]:
-    """Returns up to `places` objects, the most urgent first.
+) -> list[int]:
+    """Returns the numbers of up to `places` bodies, the most urgent first.
 
-    Objects of which no matrix was sent yet come first; then those that waited `overdue` steps, longest first; then by
-    the rule; among equals the one that waited longest, then by order. An object in flight is left out, and one whose
+    Bodies of which no matrix was sent yet come first; then those that waited `overdue` steps, longest first; then by
+    the rule; among equals the one that waited longest, then by order. A body in flight is left out, and one whose
     last matrix was sent less than min_interval steps ago (twice as long after each failure).
     """
-    priority = _PRIORITY[rule]
-
-    def urgency(request: UpdateRequest) -> tuple[int, float, int]:
-        waited = request.waited or 0
-        if request.waited is None:
-            return 0, -request.excess, 0
-        return (1, -waited, 0) if waited >= overdue else (2, -priority(request), -waited)
-
-    ready = [
-        r for r in requests if not r.in_flight and (r.waited is None or r.waited >= _with_backoff(r, min_interval))
-    ]
-    ready.sort(key=urgency)
-    return [r.object for r in ready[: max(places, 0)]]
+    new = requests.waited < 0
+    rested = new | (requests.waited >= min_interval << np.minimum(requests.failures, MAX_DOUBLINGS))
+    ready = requests.of(np.flatnonzero(rested & ~requests.in_flight))
+    new, late = ready.waited < 0, ready.waited >= overdue
+    group = np.where(new, 0, np.where(late, 1, 2))
+    first = np.where(new, ready.excess, np.where(late, ready.waited, _PRIORITY[rule](ready)))
+    order = np.lexsort((np.where(new, 0, -ready.waited), -first, group))  # the last key is the first to count
+    chosen: list[int] = ready.body[order[: max(places, 0)]].tolist()
+    return chosen
 
 
-def _with_backoff(request: UpdateRequest, min_interval: int) -> int:
-    """Returns the least number of steps between two matrices of an object."""
-    return min_interval << min(request.failures, MAX_DOUBLINGS)
+def round_duration(latencies: ArrayLike, workers: int) -> float:
+    """Returns the steps in which `workers` serve every body once; inf without workers.
 
-
-def round_duration(latencies: Sequence[float], workers: int) -> float:
-    """Returns the steps in which `workers` serve every object once; inf without workers.
-
-    latencies: steps from matrix to factor of each object
+    latencies: steps from matrix to factor of each body
     """
-    return sum(latencies) / workers if workers > 0 else inf
+    return float(np.sum(latencies)) / workers if workers > 0 else inf
 
 
-def overdue_after(rounds: float, latencies: Sequence[float], workers: int) -> float:
-    """Returns the steps after which an object goes next whatever the rule: `rounds` rounds, inf without workers."""
+def overdue_after(rounds: float, latencies: ArrayLike, workers: int) -> float:
+    """Returns the steps after which a body goes next whatever the rule: `rounds` rounds, inf without workers."""
     return rounds * round_duration(latencies, workers)
 
 
-def max_factor_age(overdue: float, latencies: Sequence[float], workers: int) -> int:
+def max_factor_age(overdue: float, latencies: ArrayLike, workers: int) -> int:
     """Returns a bound on the age of any factor in steps, -1 without workers.
 
-    An object waits until it is overdue and then behind all the others, and its matrix is copied, factorized and taken
+    A body waits until it is overdue and then behind all the others, and its matrix is copied, factorized and taken
     up while the factor before is still in use.
     """
-    if workers < 1 or not latencies:
+    if workers < 1 or not np.size(latencies):
         return -1
-    return ceil(overdue + round_duration(latencies, workers) + 2 * max(latencies) + 2)
+    return ceil(overdue + round_duration(latencies, workers) + 2 * float(np.max(latencies)) + 2)

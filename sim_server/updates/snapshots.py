@@ -5,7 +5,7 @@ The loop copies as it assembles, into memory that it is given here. A copy that 
 which is checked with it; then its memory is used again, so that in the long run none is added.
 """
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from itertools import count
 
 import numpy as np
@@ -31,12 +31,14 @@ class SnapshotPool:
         self._simulation, self._source, self._expected_latency = simulation, source, expected_latency
         self._solver = simulation.scene.solver
         self._requests = count()
+        self._requested: dict[int, BodyUpdateState] = {}  # by body; those that have been sent leave it later
         self.free: dict[tuple[int, ...], list[NDArray[np.float64]]] = {}  # by shape; pages touched before
 
     def request(self, state: BodyUpdateState) -> None:
         """Asks the loop to copy when it assembles next: the matrix, or the positions if they suffice."""
         engine, body, job = self._simulation.engine, state.body, state.job
         job.request = next(self._requests)
+        self._requested[body.index] = state
         if self._workers_assemble(state):
             job.copy = self._allocate((body.last - body.first, 3))
             job.extrapolated = self._extrapolated_time(state)
@@ -51,10 +53,10 @@ class SnapshotPool:
         step: int = self._simulation.engine.matrix_step(state.body.index)
         return step
 
-    def completed(self, states: Iterable[BodyUpdateState]) -> list[BodyUpdateState]:
-        """Returns those whose copy is there, in the order of the requests."""
-        there = (s for s in states if s.job.copy is not None and self.step(s) >= 0)
-        return sorted(there, key=lambda s: s.job.request)
+    def completed(self) -> list[BodyUpdateState]:
+        """Returns the bodies whose copy is there, in the order of the requests."""
+        self._requested = {k: state for k, state in self._requested.items() if state.job.copy is not None}
+        return sorted((s for s in self._requested.values() if self.step(s) >= 0), key=lambda s: s.job.request)
 
     def suffices(self, state: BodyUpdateState) -> bool:
         """True if the copy is all that a worker needs. Positions do not tell of the springs of a grab, nor of other

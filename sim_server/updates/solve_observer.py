@@ -27,6 +27,7 @@ class SolveObserver:
         self._driver = driver
         simulation = driver.simulation
         system, bodies = simulation.system, simulation.world.bodies
+        self._tuned = any(state.tuner is not None for state in driver.bodies)
         self._position = np.array([simulation.engine.settings(b.index).position for b in bodies])
         self._matrix_bytes = [BLOCK_BYTES * len(system.body_values(b.first, b.last)) for b in bodies]
 
@@ -63,8 +64,8 @@ class SolveObserver:
     def _observe_steps(self, r: NDArray[Any]) -> None:
         """Sums up whole steps, (steps, bodies): where bodies are many, their factors wait for this function."""
         driver, states = self._driver, self._driver.bodies
-        observe_steps(states, r, driver.solver.update_floor_iterations)
-        if all(state.tuner is None for state in states):
+        observe_steps(states, driver.table, r, driver.solver.update_floor_iterations)
+        if not self._tuned:
             return
         shortfall, used = convergence(r, driver.solver, self._position)
         solves = np.maximum(r["linearizations"], 1)

@@ -89,7 +89,7 @@ class Attacker:
         header = pb.Header(protocol=PROTOCOL, incarnation=self.victim.incarnation, object="beam", epoch=1, sequence=job)
         message = pb.Factor(header=header, worker=worker, job=job, step=job, warp=True, dtype="float32",
                             nonzeros=len(values) // 4, **fields)  # fmt: skip
-        self.put("factor/beam", values, message.SerializeToString())
+        self.put(f"factor/{worker}/beam", values, message.SerializeToString())
 
     @contextlib.contextmanager
     def fake_workers(self, count: int, answer: Callable[[str, zenoh.Sample], None]) -> Iterator[None]:
@@ -204,13 +204,15 @@ each("factor", {
     "not a number": lambda a: a.factor(a.victim.worker, 1, b"\xff" * 4096, pattern=1),
     "with 2^40 values": lambda a: a.factor(a.victim.worker, 1, b"", pattern=1, seconds=1e308),
     "of 100 MB": lambda a: a.factor(a.victim.worker, 1, bytes(100_000_000)),
-    "of an object that is none": lambda a: a.put(f"factor/{'x' * 64}", b"1", pb.Factor(worker="w").SerializeToString()),
-    "without attachment": lambda a: [a.put("factor/beam", b"1") for _ in range(100)],
-    "deleted": lambda a: [a.zenoh.delete(key(c, object="beam")) for c in ("factor", "pattern", "topology", "state")],
-    "pattern with indices out of range": lambda a: a.put("pattern/beam", pb.FactorPattern(
+    "of an object that is none": lambda a: a.put(
+        f"factor/w/{'x' * 64}", b"1", pb.Factor(worker="w").SerializeToString()),
+    "without attachment": lambda a: [a.put("factor/w/beam", b"1") for _ in range(100)],
+    "deleted": lambda a: [a.zenoh.delete(key(c, object="beam").replace("*", a.victim.worker))
+                         for c in ("factor", "pattern", "topology", "state")],
+    "pattern with indices out of range": lambda a: a.put(f"pattern/{a.victim.worker}/beam", pb.FactorPattern(
         header=pb.Header(protocol=PROTOCOL, incarnation=a.victim.incarnation, object="beam", epoch=1, sequence=1),
         rows=b"\xff" * 4000, permutation=b"\x7f" * 4000).SerializeToString()),
-    "patterns, 300 of garbage": lambda a: [a.put("pattern/beam", os.urandom(3000)) for _ in range(300)],
+    "patterns, 300 of garbage": lambda a: [a.put("pattern/w/beam", os.urandom(3000)) for _ in range(300)],
 })  # fmt: skip
 
 # --- answers and messages in the server's name ----------------------------------------------------------------------
@@ -300,7 +302,7 @@ each("command", {
     "of 1 MB": lambda a: a.ask(f"command/push/{a.name}", bytes(1_000_000)),
     "500 of garbage": lambda a: [a.flood(f"command/push/{a.name}", os.urandom(60), 1) for _ in range(500)],
     "of another version, and of another life": lambda a: [
-        a.command("pause", header=pb.Header(protocol=2)),
+        a.command("pause", header=pb.Header(protocol=PROTOCOL + 1)),
         a.command("pause", header=pb.Header(protocol=PROTOCOL, incarnation=EVIL))],
     "unknown verbs": lambda a: [a.command(v) for v in ("__class__", "exec", "STOP")],
     "parameters that are code": lambda a: [a.command("set", parameters=[pb.Parameter(key=k, value=v)]) for k, v in (
@@ -317,7 +319,7 @@ each("questions", {
     "500 probes of shared memory": lambda a: a.flood(f"echo/{a.name}", pb.Echo(
         header=pb.Header(protocol=PROTOCOL, sequence=3), nonce=5).SerializeToString(), 500),
     "300 probes of another version": lambda a: a.flood(f"echo/{a.name}", pb.Echo(
-        header=pb.Header(protocol=2)).SerializeToString(), 300),
+        header=pb.Header(protocol=PROTOCOL + 1)).SerializeToString(), 300),
 })  # fmt: skip
 
 

@@ -86,7 +86,6 @@ def test_channels() -> None:
         ("protocol.md", f"more than {WHOLE_PARTS * PART_BYTES >> 20} MiB that has no slot"),
         ("protocol.md", f"parts, {PART_BYTES >> 20} MiB each"),
         ("protocol.md", f"asked for three times, {factor_fetch.QUESTION_TIME:g} s each"),
-        ("protocol.md", f"factors of up to {CHANNELS['factor'].bulk >> 30} GiB whole"),
         ("protocol.md", f"The most is {MOST_VALUES:,} values"),
         ("protocol.md", f"above {leases.LEASE_BLOCKS:,} of them"),
         ("scenes.md", f"is at most {integrator_options.MAX_STATES}"),

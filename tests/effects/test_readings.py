@@ -43,7 +43,10 @@ def told(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactor
     logged: list[pb.ObjectStep] = []
     statuses: list[pb.Status] = []
     link: Any = SimpleNamespace(publish_status=statuses.append, wants_steps=lambda: False)
-    recorder: Any = SimpleNamespace(dropped=0, lost=0, failure="", step=lambda message, block: logged.append(message))
+    recorder: Any = SimpleNamespace(
+        dropped=0, lost=0, failure="",
+        steps=lambda steps, block: logged.extend(pb.ObjectStep.FromString(step.data) for step in steps),
+    )  # fmt: skip
     driver = Driver(sim)
     telemetry, expected = Telemetry(driver, link, recorder, patient=False), []
     for _ in range(STEPS):

@@ -128,6 +128,23 @@ def test_a_parameter_is_set_between_steps(simulation):
     np.testing.assert_allclose(simulation.v[:, 1], -9.81 * DT, atol=1e-6)
 
 
+def test_values_of_numpy_are_set_and_several_at_once_or_none():
+    with wf.Simulation(falling(wf.Mesh(GRID.rest, GRID.tets))) as simulation:
+
+        def values() -> tuple[str, ...]:
+            found = {each.field.key: each.text for each in simulation.inside.parameters}
+            return found["effects.gravity.g"], found["object.cube.effects.corotational.young"]
+
+        simulation.set("gravity.g", np.array([0, -1, 0]))
+        simulation.set("cube.corotational.young", np.float32(2e4))
+        assert values() == ("[0.0, -1.0, 0.0]", "20000.0")
+        simulation.set({"gravity.g": (0, np.int64(-9), 0), "cube.corotational.young": np.int32(30_000)})
+        assert values() == ("[0.0, -9.0, 0.0]", "30000.0")
+        with pytest.raises(InputError, match="young"):
+            simulation.set({"gravity.g": [0, 0, 0], "cube.corotational.young": np.nan})
+        assert values() == ("[0.0, -9.0, 0.0]", "30000.0")
+
+
 def test_a_scene_of_the_package_is_read_with_other_values():
     scene = wf.Scene.load("gallery/beam", ["dt=0.005"])
     assert scene.table()["dt"] == 0.005 and scene.table()["object"][0]["name"] == "beam"

@@ -190,6 +190,17 @@ def test_parameters_are_drawn_from_the_seed_of_each_copy():
     env.close()
 
 
+def test_parameters_of_all_copies_are_set_at_once(monkeypatch):
+    """Each change has the whole scene checked: one for each copy would take the square of their number."""
+    env = made(randomize=lambda random: {"finger.corotational.young": np.float32(random.integers(50, 500) * 1e3)})
+    parameters, given = env.simulation.inside.parameters, []
+    set_them = parameters.set
+    monkeypatch.setattr(parameters, "set", lambda values, *rest: given.append(values) or set_them(values, *rest))
+    env.reset(seed=3)
+    assert [len(each) for each in given] == [N]
+    env.close()
+
+
 def test_a_copy_that_runs_away_is_truncated_and_begins_again():
     """Pulled by far more than its law bears; the others go on."""
     env = made(wf.gym.Forces("tip", 1e9), max_episode_steps=None, autoreset_mode=AutoresetMode.NEXT_STEP)

@@ -426,7 +426,7 @@ def test_factors_of_a_server_that_is_gone_are_dropped(worker: Worker, connection
 @pytest.mark.parametrize(
     ("changes", "kind"),
     [
-        ({"header": Header(protocol=2, incarnation=7, object="beam")}, "version"),
+        ({"header": Header(protocol=PROTOCOL + 1, incarnation=7, object="beam")}, "version"),
         ({"header": Header(protocol=PROTOCOL, incarnation=6, object="beam")}, "incarnation"),
         ({"worker": "x"}, "worker"),
         ({"factor_dtype": "float16"}, "malformed"),

@@ -134,7 +134,9 @@ def test_foreign_mcap_file(tmp_path: Path) -> None:
 def test_another_protocol_version(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("sim_server.recording.mcap_file.PROTOCOL", PROTOCOL + 41)
     path = record(tmp_path / "new.mcap", 1)
-    with pytest.raises(BadInput, match=f"protocol version {PROTOCOL + 41}; this program reads version {PROTOCOL}"):
+    with pytest.raises(
+        BadInput, match=f"protocol version {PROTOCOL + 41}; this program reads versions 1 to {PROTOCOL}"
+    ):
         Log(path)
 
 

@@ -5,6 +5,7 @@ import os
 import resource
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -12,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from clients.errors import BadInput
 from clients.log.reader import Log
 from protocol import messages_pb2 as pb
 from protocol.log_chunks import BadLog
@@ -107,15 +109,149 @@ def test_a_budget_removes_the_oldest_files(tmp_path: Path) -> None:
         assert seen == list(range(seen[0], 501)) and seen[0] > 1, "the newest are there, without a gap"
 
 
-def test_time_begins_a_new_file_and_an_idle_log_none(tmp_path: Path) -> None:
+class Due(Rotation):
+    """A new file is due when a test says so."""
+
+    now = False
+
+    def due(self, size: int, age: float) -> bool:
+        return Due.now
+
+
+@pytest.fixture
+def due(monkeypatch: pytest.MonkeyPatch) -> Due:
+    monkeypatch.setattr(Due, "now", False)
+    monkeypatch.setattr("sim_server.recording.recorder.LOOK_SECONDS", 0.02)
+    return Due()
+
+
+def in_pieces(path: Path, count: int, due: Due) -> None:
+    """Writes a log of as many pieces, each with a step and a frame of its number."""
+    with Recorder(path, rotation=due) as recorder:
+        begin(recorder)
+        for k in range(1, count + 1):
+            steps(recorder, k, k, frame=100)
+            until(lambda k=k: recorder.written == 2 + 3 * k)
+            Due.now = k < count
+            until(lambda k=k: len(later_pieces(path)) == min(k, count - 1))
+            Due.now = False
+
+
+def test_time_begins_a_new_file_and_an_idle_log_none(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, due: Due) -> None:
     path = tmp_path / "run.mcap"
     with Recorder(path, rotation=Rotation(seconds=0.3)) as recorder:
         begin(recorder)
+        until(lambda: later_pieces(path))
+    path = tmp_path / "idle.mcap"
+    looks = []
+    with Recorder(path, rotation=due) as recorder:
+        keep = recorder._pieces._kept.keep_budget
+        monkeypatch.setattr(recorder._pieces._kept, "keep_budget", lambda size: looks.append(keep(size)))
+        begin(recorder)
+        until(lambda: recorder.written == 2)
+        Due.now = True
         until(lambda: len(later_pieces(path)) == 1)
-        time.sleep(1.2)
+        done = len(looks)
+        until(lambda: len(looks) > done + 5)
         assert len(later_pieces(path)) == 1, "nothing came: nothing is begun"
+        Due.now = False
         steps(recorder, 1, 1)
+        until(lambda: recorder.written == 5)
+        Due.now = True
         until(lambda: len(later_pieces(path)) == 2)
+
+
+def test_a_log_of_many_pieces_needs_few_open_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, due: Due) -> None:
+    path = tmp_path / "run.mcap"
+    in_pieces(path, 9, due)
+    monkeypatch.setattr("protocol.log_file.OPEN", 3)
+
+    def held() -> int:
+        links = (os.path.realpath(f"/proc/self/fd/{name}") for name in os.listdir("/proc/self/fd"))
+        return sum(link.startswith(str(tmp_path)) for link in links)
+
+    with Log(path) as log:
+        assert held() <= 4
+        assert log.complete and [frame.step for frame in log.frames("beam")] == list(range(1, 10))
+        assert [log.frame("beam", k).step for k in (8, 0, 7, 1)] == [9, 1, 8, 2]
+        assert held() <= 4
+    assert held() == 0
+
+
+def test_a_piece_that_is_missing_between_others_is_told(tmp_path: Path, due: Due) -> None:
+    path = tmp_path / "run.mcap"
+    in_pieces(path, 5, due)
+    later_pieces(path)[1][1].unlink()
+    with Log(path) as log:
+        assert not log.complete and [frame.step for frame in log.frames("beam")] == [1, 2, 4, 5]
+        (note,) = log.notes
+        assert "run.0004.mcap: before it piece 3 of the log is missing" in note
+    with Log(later_pieces(path)[0][1]) as log:
+        assert log.complete, "a piece that is opened alone has none before it"
+
+
+def test_pieces_that_go_while_a_log_is_opened_are_not_missed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, due: Due
+) -> None:
+    """As a recorder that keeps a budget removes them."""
+    path = tmp_path / "run.mcap"
+    in_pieces(path, 4, due)
+
+    def listed(of: Path) -> list[tuple[int, Path]]:
+        found = later_pieces(of)
+        of.unlink()
+        found[0][1].unlink()
+        return found
+
+    monkeypatch.setattr("protocol.log_file.later_pieces", listed)
+    with Log(path) as log:
+        assert log.complete and [frame.step for frame in log.frames("beam")] == [3, 4]
+
+
+def test_a_file_that_is_replaced_while_it_is_read_is_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, due: Due
+) -> None:
+    path = tmp_path / "run.mcap"
+    in_pieces(path, 3, due)
+    monkeypatch.setattr("protocol.log_file.CHUNKS", 1)
+    with Log(path) as log:
+        with Recorder(path, overwrite=True) as recorder:  # the same file, begun anew
+            begin(recorder)
+        with pytest.raises(BadInput, match=r"run\.mcap.*the file was changed or removed since it was opened"):
+            log.frame("beam", 0)
+        assert log.frame("beam", 1).step == 2, "removed, and still open"
+
+
+def test_what_a_damaged_beginning_repeats_costs_no_message(tmp_path: Path, due: Due) -> None:
+    path = tmp_path / "run.mcap"
+    in_pieces(path, 3, due)
+    second = later_pieces(path)[0][1]
+    with LogFile.open(second) as alone:
+        offset = next(alone.messages()).offset
+    data = bytearray(second.read_bytes())
+    data[offset + 60] ^= 0xFF
+    second.write_bytes(data)
+    with Log(path) as log:
+        assert [frame.step for frame in log.frames("beam")] == [1, 2, 3]
+        assert sorted(log.scalars("beam")["step"]) == [1, 2, 3]
+        assert not log.complete and "is damaged and left out" in log.notes[0]
+
+
+def test_a_file_that_is_moved_away_is_whole_there(tmp_path: Path, due: Due) -> None:
+    path, away = tmp_path / "run.mcap", tmp_path / "away.mcap"
+    with Recorder(path, rotation=due) as recorder:
+        begin(recorder)
+        steps(recorder, 1, 3)
+        until(lambda: recorder.written == 11)
+        path.rename(away)
+        Due.now = True
+        until(lambda: later_pieces(path))
+        Due.now = False
+        steps(recorder, 4, 5)
+    assert not recorder.failure and recorder.lost == 0
+    for file, expected in ((away, [1, 2, 3]), (path, [4, 5])):
+        with Log(file) as log:
+            assert log.complete and [frame.step for frame in log.frames("beam")] == expected
 
 
 def test_files_of_an_earlier_log_are_replaced_and_others_are_not(tmp_path: Path) -> None:
@@ -133,9 +269,11 @@ def test_files_of_an_earlier_log_are_replaced_and_others_are_not(tmp_path: Path)
     assert (tmp_path / "run.0099.mcap").read_text() == "precious"
 
 
-def test_a_removed_file_is_told_and_a_new_one_begun(tmp_path: Path) -> None:
+def test_a_removed_file_is_told_and_a_new_one_begun(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path, told = tmp_path / "run.mcap", []
     with Recorder(path, report=told.append) as recorder:
+        may_go_on, room = recorder._pieces.may_go_on, threading.Event()
+        monkeypatch.setattr(recorder._pieces, "may_go_on", lambda first: room.is_set() and may_go_on(first))
         begin(recorder)
         steps(recorder, 1, 5)
         until(lambda: recorder.written == 17)
@@ -143,6 +281,7 @@ def test_a_removed_file_is_told_and_a_new_one_begun(tmp_path: Path) -> None:
         until(lambda: recorder.broken)  # though nothing is written
         assert "the file was removed" in recorder.failure
         steps(recorder, 6, 6)  # lost
+        room.set()
         until(lambda: not recorder.broken)
         steps(recorder, 7, 12)
     assert len(told) == 2 and "it goes on in" in told[1] and "3 records are missing" in told[1]

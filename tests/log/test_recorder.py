@@ -101,6 +101,8 @@ def test_full_disk_stops_the_recording_only(caplog: pytest.LogCaptureFixture) ->
 class _StuckFile:
     """Stands for a disk that takes nothing until told."""
 
+    regular = closed = False
+
     def __init__(self) -> None:
         self.go = threading.Event()
         self.topics: list[str] = []
@@ -117,8 +119,9 @@ class _StuckFile:
     def check_exists(self) -> None:
         pass
 
-    def finish(self, notes: dict[str, str]) -> None:
+    def finish(self, notes: dict[str, str]) -> int:
         self.notes = notes
+        return self.size
 
 
 @pytest.fixture

@@ -21,7 +21,7 @@ def test_every_row_names_a_message_of_the_schema_and_a_limit() -> None:
 def test_keys_are_those_of_the_table() -> None:
     assert key("status") == "warpfactor/sim/status"
     assert key("matrix", "hub", worker="w-1", object="left.arm") == "warpfactor/hub/matrix/w-1/left.arm"
-    assert key("factor") == "warpfactor/sim/factor/*"
+    assert key("factor") == "warpfactor/sim/factor/*/*"
     assert everything("hub") == "warpfactor/hub/**"
 
 
@@ -30,7 +30,10 @@ def test_names_are_read_back_from_keys() -> None:
     assert (name_in("matrix", received, "worker"), name_in("matrix", received, "object")) == ("w", "o_1")
 
 
-@pytest.mark.parametrize("received", ["warpfactor/sim/factor/a/b", "warpfactor/sim/factor/", "other/sim/factor/a", "*"])
+@pytest.mark.parametrize(
+    "received",
+    ["warpfactor/sim/factor/a", "warpfactor/sim/factor/w/", "warpfactor/sim/factor/w/a/b", "other/sim/factor/w/a", "*"],
+)
 def test_keys_of_another_form_are_refused(received: str) -> None:
     with pytest.raises(Refused, match="not of the form factor"):
         name_in("factor", received, "object")

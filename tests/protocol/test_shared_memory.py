@@ -57,6 +57,27 @@ def test_a_slot_given_back_twice_is_lent_once(pool: SlotPool) -> None:
     assert pool.lent == 2
 
 
+def test_a_slot_of_several_users_is_lent_again_after_the_last_one(pool: SlotPool) -> None:
+    slot = pool.lend(100_000, users=3)
+    assert slot is not None
+    pool.give_back(slot)
+    pool.give_back(slot)
+    other = pool.lend(100_000)
+    assert other is not slot and pool.lent == 2
+    pool.give_back(slot)
+    assert pool.lend(100_000) is slot
+
+
+def test_the_longest_unused_slot_makes_room(pool: SlotPool) -> None:
+    """Of slots of several sizes, that of whichever size."""
+    sizes = (3 << 20, 2 << 20, 1 << 20)
+    slots = [pool.lend(size) for size in sizes]
+    for slot in (slots[1], slots[0], slots[2]):
+        pool.give_back(slot)
+    assert pool.lend(3 << 20) is slots[0]
+    assert pool.lend(4 << 20) is not None and pool.bytes == (3 + 1 + 4) << 20, "that of 2 MiB went"
+
+
 def test_the_limit_holds_and_free_slots_make_room(pool: SlotPool) -> None:
     big = pool.lend(5 << 20)
     assert big is not None and pool.lend(5 << 20) is None

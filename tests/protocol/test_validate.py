@@ -43,7 +43,7 @@ def header(**changes: object) -> Header:
 @pytest.mark.parametrize(
     ("changes", "kind", "text"),
     [
-        ({"protocol": PROTOCOL + 1}, "version", r"Factor.header.protocol is 2; allowed: 1"),
+        ({"protocol": PROTOCOL + 1}, "version", rf"Factor.header.protocol is {PROTOCOL + 1}; allowed: {PROTOCOL}"),
         ({"protocol": 0}, "version", "Factor.header.protocol is 0"),
         ({"incarnation": 8}, "incarnation", "Factor.header.incarnation is 0000000000000008; allowed: 0000000000000007"),
         ({"object": "liver"}, "object", "Factor.header.object is 'liver'; allowed: beam"),

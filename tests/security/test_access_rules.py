@@ -58,8 +58,8 @@ def test_verbs_of_the_roles() -> None:
 
 
 @pytest.mark.parametrize("name", [*CLIENTS, "mill"])
-@pytest.mark.parametrize("key", ["**", "sim/**", "*/**", "sim/*", "sim/matrix/**", "sim/factor/*", "sim/pattern/*",
-                                 "sim/alive/**", "sim/worker/*"])  # fmt: skip
+@pytest.mark.parametrize("key", ["**", "sim/**", "*/**", "sim/*", "sim/matrix/**", "sim/factor/*/*",
+                                 "sim/factor/mill.w/*", "sim/pattern/**", "sim/alive/**", "sim/worker/*"])  # fmt: skip
 def test_nobody_listens_to_everything_or_to_jobs_of_others(name: str, key: str) -> None:
     assert not allowed(name, "declare_subscriber", "ingress", key)
 
@@ -87,7 +87,13 @@ def test_a_client_looks_and_is_no_worker(name: str) -> None:
     assert allowed(name, "liveliness_token", "ingress", f"sim/alive/client/{name}.client-1")
     for key in ("alive/client/mill.c", "alive/client/client-1", f"alive/worker/{name}.w"):
         assert not allowed(name, "liveliness_token", "ingress", f"sim/{key}")
-    for key in ("factor/beam", "pattern/beam", f"worker/{name}.w", "matrix/mill.w/beam"):
+    for key in (
+        f"factor/{name}.w/beam",
+        f"pattern/{name}.w/beam",
+        "factor/beam",
+        f"worker/{name}.w",
+        "matrix/mill.w/beam",
+    ):
         assert not allowed(name, "put", "ingress", f"sim/{key}") and not allowed(name, "put", "egress", f"sim/{key}")
     assert not allowed(name, "query", "ingress", f"sim/echo/{name}.w")
     for message in ("query", "declare_queryable", "reply"):
@@ -96,7 +102,7 @@ def test_a_client_looks_and_is_no_worker(name: str) -> None:
 
 
 def test_a_worker_has_the_jobs_under_its_own_names() -> None:
-    for key in ("factor/beam", "pattern/beam", "worker/mill.w1"):
+    for key in ("factor/mill.w1/beam", "pattern/mill.w1/beam", "worker/mill.w1"):
         assert allowed("mill", "put", "ingress", f"sim/{key}")
     assert allowed("mill", "declare_subscriber", "ingress", "sim/matrix/mill.w1/*")
     assert allowed("mill", "put", "egress", "sim/matrix/mill.w1/beam")
@@ -109,7 +115,8 @@ def test_a_worker_has_the_jobs_under_its_own_names() -> None:
     for name in ("other.w1", "mill", "w1", "*"):
         assert not allowed("mill", "declare_subscriber", "ingress", f"sim/matrix/{name}/*")
         assert not allowed("mill", "put", "egress", f"sim/matrix/{name}/beam")
-        assert not allowed("mill", "put", "ingress", f"sim/worker/{name}")
+        for channel in ("worker/{}", "factor/{}/beam", "pattern/{}/beam"):
+            assert not allowed("mill", "put", "ingress", f"sim/{channel.format(name)}")
         for message in ("declare_queryable", "reply", "query"):
             assert not allowed("mill", message, "ingress", f"sim/part/{name}")
         assert not allowed("mill", "liveliness_token", "ingress", f"sim/alive/worker/{name}")

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import zenoh
 from cryptography import x509
 from cryptography.hazmat.primitives import hashes, serialization
 
@@ -32,6 +33,7 @@ from tests.system.link_helpers import DenseAnalysis, Driver, chain, dense, free_
 from tests.system.server_process import PATIENCE, Stage, beam, run, until
 
 pytestmark = pytest.mark.system
+BLOCK = zenoh.CongestionControl.BLOCK
 
 
 def certs(folder: Path, *arguments: str) -> None:
@@ -47,7 +49,7 @@ class TlsStage(Stage):
         self.endpoint = self.endpoint.replace("tcp/", "tls/")
         self.certs = folder / "certs"
         certs(self.certs, "--host", "localhost", "--client", "alice:participant", "--client", "bob:operator",
-              "--client", "late:operator")  # fmt: skip
+              "--client", "late:operator", "--client", "mill:worker")  # fmt: skip
         roles = self.certs / "roles.toml"
         roles.write_text(roles.read_text().replace('late = "operator"\n', ""))
         everywhere = self.endpoint.replace("127.0.0.1", "0.0.0.0")
@@ -192,6 +194,32 @@ def test_who_has_no_certificate_of_a_worker_is_none(stage: TlsStage) -> None:
         assert [w.worker for w in bob.status().workers] == ["worker.local-1"]
     until(lambda: "'viewer' was made for a viewer: a server that has it as one" in wrong.output(), "it says so")
     assert (plain.end(), wrong.end()) == (0, 0)
+
+
+def test_a_worker_sends_factors_in_its_own_name_alone(stage: TlsStage) -> None:
+    """Access rules go by the worker in the key; the server compares it with that of the message."""
+    mill, count = identity_of(stage.certs / "mill", ()), 20
+    with stage.as_("bob") as bob, open_session("client", connect=[stage.endpoint], shared_memory=False,
+                                               tls=mill) as session:  # fmt: skip
+
+        def used() -> int:
+            return bob.status(fresh=True).objects[0].last.factor_step
+
+        until(lambda: used() >= 0, "a factor is used")
+        before = bob.status(fresh=True)
+        header = pb.Header(protocol=PROTOCOL, incarnation=before.header.incarnation, object="beam", epoch=1)
+        answer = pb.Factor(header=header, worker="worker.local-1", failure="no")
+        pattern = pb.FactorPattern(header=header)
+        for where in ("worker.local-1", "mill.w"):  # the second ones come last: then the first ones never will
+            for answer.job in range(1, count + 1):
+                names = {"worker": where, "object": "beam"}
+                session.zenoh.put(key("factor", **names), b"", attachment=answer.SerializeToString(),
+                                  congestion_control=BLOCK)  # fmt: skip
+                session.zenoh.put(key("pattern", **names), pattern.SerializeToString(), congestion_control=BLOCK)
+        until(lambda: bob.status(fresh=True).refused >= before.refused + 2 * count, "what has its own name comes")
+        last = used()
+        until(lambda: used() > last, "factors of the other one")
+        assert bob.status(fresh=True).refused == before.refused + 2 * count
 
 
 def test_an_open_server_does_not_start_and_insecure_overrides_it_with_a_warning(tmp_path: Path) -> None:

@@ -87,7 +87,10 @@ def test_the_status_and_the_log_tell_the_age_of_factors_and_its_bound():
     sim = simulation(*bodies, gravity=(0, -9.81, 0), preconditioner="cholesky", schedule_rounds=2.0)
     found, logged = [], []
     link = SimpleNamespace(publish_status=found.append, wants_steps=lambda: False)
-    recorder = SimpleNamespace(dropped=0, lost=0, failure="", step=lambda message, block: logged.append(message))
+    recorder = SimpleNamespace(
+        dropped=0, lost=0, failure="",
+        steps=lambda steps, block: logged.extend(pb.ObjectStep.FromString(step.data) for step in steps),
+    )  # fmt: skip
     driver = Driver(sim)
     telemetry = Telemetry(driver, link, recorder, patient=False)  # type: ignore[arg-type]
     telemetry.publish_status("running")

@@ -69,7 +69,7 @@ class HandWorker:
         analysis = DenseAnalysis(np.frombuffer(topology.row_start, np.int32), np.frombuffer(topology.columns, np.int32))
         values = analysis.factorize(matrix(topology, shift), job.factor_dtype)
         pattern = analysis.pattern.message(self.header(job.header.object, job.header.epoch))
-        self.put("pattern", pattern.SerializeToString(), object=job.header.object)
+        self.put("pattern", pattern.SerializeToString(), worker=self.name, object=job.header.object)
         answer = Factor(
             header=self.header(job.header.object, job.header.epoch),
             step=job.step,
@@ -86,7 +86,7 @@ class HandWorker:
 
     def answer(self, answer: Factor, values: np.ndarray | bytes = b"", object: str | None = None) -> None:
         data = values if isinstance(values, bytes) else values.tobytes()
-        self.put("factor", data, answer.SerializeToString(), object=object or answer.header.object)
+        self.put("factor", data, answer.SerializeToString(), worker=self.name, object=object or answer.header.object)
 
     def close(self) -> None:
         self.session.close()

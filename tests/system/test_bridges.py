@@ -161,6 +161,30 @@ def test_ros_2_sees_a_body_grabs_it_and_moves_a_tool(stage: Stage, started: Any)
     assert bridge.wait(PATIENCE) == 1 and bridge.stderr.read().startswith("ros2: ")
 
 
+def test_ros_2_grabs_again_after_a_reset_and_ends_with_the_server(stage: Stage, started: Any) -> None:
+    ros = Rosbridge()
+    bridge = started("ros2.py", "--rosbridge", ros.url)
+    held, corner = "/warpfactor/organ/grab_wrench", dict(zip("xyz", (0.15, 0.08, 0.1), strict=True))
+
+    def feels() -> bool:
+        ros.say("/warpfactor/organ/grab", header=NOW, point=corner)
+        time.sleep(0.05)
+        return held in ros.newest
+
+    with stage.client() as client:
+        client.pause()
+        until(lambda: len(ros.wanted) == 3, "the bridge listens")
+        ros.say("/warpfactor/organ/grab", header=NOW, point=corner)  # no step is with it before it goes on
+        client.resume()
+        until(feels, "the corner is held")
+        client.reset("organ")
+        ros.newest.clear()
+        until(feels, "it is held again")
+        client.stop()
+    assert bridge.wait(PATIENCE) == 1 and ros.faults == []
+    assert bridge.stderr is not None and bridge.stderr.read().splitlines()[-1].startswith("ros2: ")
+
+
 def test_slicer_sees_surfaces_and_moves_a_tool(stage: Stage, started: Any) -> None:
     """A client of pyigtl stands for Slicer. Surfaces, which it does not know, are read here by the specification."""
     pyigtl = pytest.importorskip("pyigtl")

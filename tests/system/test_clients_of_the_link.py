@@ -98,7 +98,7 @@ def test_commands_reach_the_simulation_and_replies_the_client(stage: tuple[Drive
 @pytest.mark.parametrize(
     ("payload", "text"),
     [
-        (mine(Header()), "Command.header.protocol is 0; allowed: 1"),
+        (mine(Header()), f"Command.header.protocol is 0; allowed: {PROTOCOL}"),
         (b"", "a Command, '' of '', came under the key"),
         (b"\xff\xff\xff", "is not a valid message"),
         (b"\0" * 70_000, "Command has 70000 bytes; allowed: at most 65536"),

@@ -15,7 +15,7 @@ from clients.errors import BadInput, ClientError
 from clients.log.reader import Log
 from clients.subscriptions import Steps
 from protocol import messages_pb2 as pb
-from protocol.channels import key
+from protocol.channels import PROTOCOL, key
 from protocol.network.session import open_session
 from tests.system.server_process import Stage, run, until
 from tests.system.test_replay_of_a_server import CPU
@@ -210,7 +210,7 @@ def test_malformed_messages_on_the_channel_are_left_out(stage: Stage, tmp_path: 
         own = client.status().header.incarnation
         sent = [b"\xff" * 50, b"", b"\0" * (2 << 20)]
         for incarnation, force in ((own, float("nan")), (own + 1, 1e6), (0, 1e6)):
-            header = pb.Header(protocol=1, incarnation=incarnation)
+            header = pb.Header(protocol=PROTOCOL, incarnation=incarnation)
             bad = pb.Steps(header=header, steps=[pb.ObjectStep(header=pb.Header(object="lower"), step=1 << 60)])
             bad.steps[0].reactions.add(obstacle="floor", force=pb.Vector(y=force))
             sent.append(bad.SerializeToString())

@@ -11,7 +11,7 @@ import zenoh
 from hand_worker import HandWorker
 from link_helpers import Driver, chain, free_endpoint, light_worker, process
 
-from protocol.channels import key
+from protocol.channels import PROTOCOL, key
 from protocol.messages_pb2 import Header, WorkerInfo
 from protocol.network.session import open_session
 from sim_server.network.link import ServerLink
@@ -34,7 +34,7 @@ class Forger:
         return [self.zenoh.liveliness().declare_token(key(channel, **{field: name})) for name in names]
 
     def hello(self, incarnation: int, name: str, sequence: int = 1, pid: int = 1, host: str = "here") -> None:
-        header = Header(protocol=1, incarnation=incarnation, sequence=sequence)
+        header = Header(protocol=PROTOCOL, incarnation=incarnation, sequence=sequence)
         info = WorkerInfo(header=header, worker=name, pid=pid, host=host)
         self.zenoh.put(
             key("worker", worker=name), info.SerializeToString(), congestion_control=zenoh.CongestionControl.BLOCK
@@ -152,11 +152,15 @@ def test_a_worker_of_another_version_is_told_and_the_server_says_so_once(
     with caplog.at_level(logging.WARNING), process(*command) as child:
         assert child.stderr is not None
         line = child.stderr.readline()
-        assert "server sim speaks protocol version 1, this worker version 2: it is not served" in line
+        assert (
+            f"server sim speaks protocol version {PROTOCOL}, this worker version {PROTOCOL + 1}: it is not served"
+            in line
+        )
         driver.until(lambda: driver.link.counters.refusals["version"] >= 3, "it to ask again")
         assert driver.link.dispatch.workers() == []
         child.terminate()
         out, err = child.communicate(timeout=30)
         assert (out, err, child.returncode) == ("", "", 0)
-    told = [record.message for record in caplog.records if "worker newer speaks protocol version 2" in record.message]
-    assert len(told) == 1 and "this server version 1" in told[0]
+    sentence = f"worker newer speaks protocol version {PROTOCOL + 1}"
+    told = [record.message for record in caplog.records if sentence in record.message]
+    assert len(told) == 1 and f"this server version {PROTOCOL}" in told[0]

@@ -25,7 +25,9 @@ def answered(hand: HandWorker, topology: Topology, edit: Callable[[np.ndarray, n
     analysis = DenseAnalysis(np.frombuffer(topology.row_start, np.int32), np.frombuffer(topology.columns, np.int32))
     values = analysis.factorize(np.frombuffer(bytes(hand.payload)).reshape(-1, 3, 3), job.factor_dtype)
     edit(values, analysis.pattern.diagonal)
-    hand.put("pattern", analysis.pattern.message(hand.header("bar", 1)).SerializeToString(), object="bar")
+    hand.put(
+        "pattern", analysis.pattern.message(hand.header("bar", 1)).SerializeToString(), worker="hand", object="bar"
+    )
     answer = Factor(
         header=hand.header("bar", 1), step=job.step, warp=job.warp, pattern=analysis.pattern.id, dtype=job.factor_dtype,
         nonzeros=len(values), checksum=checksum(values), worker="hand", seconds=0.01, job=job.header.sequence,

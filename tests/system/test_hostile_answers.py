@@ -84,6 +84,11 @@ def of_another_pattern(hand: HandWorker, job: Matrix, answer: Factor, values: np
     hand.answer(answer, values)
 
 
+def of_another_worker(hand: HandWorker, job: Matrix, answer: Factor, values: np.ndarray) -> None:
+    answer.worker = "other"
+    hand.put("factor", values.tobytes(), answer.SerializeToString(), worker="other", object="beam")
+
+
 # Wrong in its content: the job is over, and the object may be sent again at once.
 CONTENT: dict[str, tuple[str, Wrong]] = {
     "NaN": ("not_finite", with_values(put(5, math.nan))),
@@ -112,27 +117,33 @@ ENVELOPE: dict[str, tuple[str, Wrong]] = {
     "future epoch": ("epoch", with_field(header__epoch=2)),
     "job never sent": ("sequence", with_field(job=10**9)),
     "job of the past": ("duplicate", with_field(job=1)),
-    "job of another worker": ("duplicate", with_field(worker="other")),
+    "job of another worker": ("duplicate", of_another_worker),
+    "name of another worker": ("worker", with_field(worker="other")),
     "NaN seconds": ("not_finite", with_field(seconds=math.nan)),
     "negative seconds": ("malformed", with_field(seconds=-1.0)),
     "endless text": ("size", with_field(failure="x" * 10_000)),
-    "no message": ("malformed", lambda hand, job, answer, values: hand.put("factor", b"", object="beam")),
+    "no message": (
+        "malformed",
+        lambda hand, job, answer, values: hand.put("factor", b"", worker="hand", object="beam"),
+    ),
     "random bytes": (
         "malformed",
-        lambda hand, job, answer, values: hand.put("factor", b"", b"\xff" * 40, object="beam"),
+        lambda hand, job, answer, values: hand.put("factor", b"", b"\xff" * 40, worker="hand", object="beam"),
     ),
     "message too long": (
         "size",
-        lambda hand, job, answer, values: hand.put("factor", b"", b"\0" * (1 << 17), object="beam"),
+        lambda hand, job, answer, values: hand.put("factor", b"", b"\0" * (1 << 17), worker="hand", object="beam"),
     ),
     "cut message": (
         "malformed",
-        lambda hand, job, answer, values: hand.put("factor", b"", answer.SerializeToString()[:-3], object="beam"),
+        lambda hand, job, answer, values: hand.put(
+            "factor", b"", answer.SerializeToString()[:-3], worker="hand", object="beam"
+        ),
     ),
     "key of another object": ("object", lambda hand, job, answer, values: hand.answer(answer, values, "liver")),
     "matrix sent back": (
         "malformed",
-        lambda hand, job, answer, values: hand.put("factor", b"", b"\x12\x80", object="beam"),
+        lambda hand, job, answer, values: hand.put("factor", b"", b"\x12\x80", worker="hand", object="beam"),
     ),
 }
 
@@ -258,10 +269,10 @@ def test_wrong_patterns_are_refused(stage: tuple[Driver, HandWorker]) -> None:
         spoiled = FactorPattern.FromString(good.SerializeToString())
         change(spoiled, wrong)
         before = driver.link.counters.refusals[kind]
-        hand.put("pattern", spoiled.SerializeToString(), object="beam")
+        hand.put("pattern", spoiled.SerializeToString(), worker="hand", object="beam")
         driver.until(refused(driver, kind, before + 1), str(wrong))
     before = driver.link.counters.refusals["shape"]
-    hand.put("pattern", small.pattern.message(hand.header("beam", 1)).SerializeToString(), object="beam")
+    hand.put("pattern", small.pattern.message(hand.header("beam", 1)).SerializeToString(), worker="hand", object="beam")
     driver.until(refused(driver, "shape", before + 1), "a pattern of another size")
     good_round(driver, hand, next(STEPS))
 
@@ -271,8 +282,8 @@ def test_random_bytes_on_every_channel_do_no_harm(stage: tuple[Driver, HandWorke
     noise, before = random.Random(1), driver.link.counters.refused
     for _ in range(20):
         data = noise.randbytes(noise.randrange(1, 200))
-        hand.put("factor", data, data, object="beam")
-        hand.put("pattern", data, object="beam")
+        hand.put("factor", data, data, worker="hand", object="beam")
+        hand.put("pattern", data, worker="hand", object="beam")
         hand.put("worker", data, worker="hand")
     driver.until(lambda: driver.link.counters.refused >= before + 60, "60 refusals")
     good_round(driver, hand, next(STEPS))

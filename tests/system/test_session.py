@@ -144,7 +144,7 @@ def test_what_nobody_takes_blocks_nobody() -> None:
         link.publish_status(Status(scene="asleep"))
         for _ in range(2500):
             hand.hello()
-            hand.put("factor", b"x" * 100, b"y" * 100, object="beam")
+            hand.put("factor", b"x" * 100, b"y" * 100, worker="hand", object="beam")
         replies = list(hand.session.zenoh.get(key("status"), timeout=10))
         assert [Status.FromString(bytes(reply.ok.payload)).scene for reply in replies if reply.ok] == ["asleep"]
         driver = Driver(link)

@@ -82,8 +82,10 @@ def told(listening: bool, monkeypatch) -> tuple[list[pb.Steps], list[pb.Status],
     """Steps and statuses that went out, and how many messages of steps were made before the status was."""
     driver = drivers("cholesky")[0]
     made, sent, statuses = [], [], []
-    plain = messages.steps
-    monkeypatch.setattr(messages, "steps", lambda sim, records, *more: made.extend(records) or plain(sim, records))
+    plain = messages.encoded_steps
+    monkeypatch.setattr(
+        messages, "encoded_steps", lambda sim, records, *more, **rest: made.extend(records) or plain(sim, records)
+    )
     link = SimpleNamespace(wants_steps=lambda: listening, publish_steps=sent.append, publish_status=statuses.append)
     telemetry = Telemetry(driver, link, None, patient=False)  # type: ignore[arg-type]
     records = solves(np.random.default_rng(0), 0, 10).ravel()
@@ -104,4 +106,10 @@ def test_steps_become_messages_only_if_somebody_listens(monkeypatch):
 
 def test_a_listener_gets_every_step(monkeypatch):
     sent, _, made = told(True, monkeypatch)
-    assert made == 30 and [s.step for s in sent[0].steps] == sorted([*range(1, 11)] * 3)
+    assert made == 30 and [s.step for s in sent[0].steps] == sorted([*range(1, 11)] * 3) and sent[0].left_out == 0
+
+
+def test_a_listener_is_told_how_many_were_left_out(monkeypatch):
+    monkeypatch.setattr("sim_server.service.telemetry.MAX_BATCH", 7)
+    sent, _, made = told(True, monkeypatch)
+    assert made == 7 and len(sent[0].steps) == 7 and sent[0].left_out == 23

@@ -3,6 +3,7 @@
 
 import time
 
+import numpy as np
 import pytest
 
 from sim_server.updates.driver import Driver
@@ -34,17 +35,17 @@ def paced(period: float, steps: int = 20) -> PrefetchDepth:
 )
 def test_as_many_as_workers_can_take_within_a_step(period, service, workers, depth):
     prefetch = paced(period)
-    prefetch.update([service, None, service], workers)
+    prefetch.update(np.array([service, np.nan, service]), workers)
     assert prefetch.depth == pytest.approx(depth, abs=1)
     assert TRANSFER < 0.002
 
 
 def test_nothing_is_known_before_the_first_steps_and_factors():
     prefetch = PrefetchDepth()
-    prefetch.update([0.001], 4)
+    prefetch.update(np.array([0.001]), 4)
     assert prefetch.depth == 0
     prefetch = paced(1.0)
-    prefetch.update([None, None], 4)
+    prefetch.update(np.array([np.nan, np.nan]), 4)
     assert prefetch.depth == 0
 
 

@@ -13,7 +13,7 @@ from sim_server.backends.rosenbrock import FORMS
 from sim_server.scene.solver_options import Rule
 from sim_server.updates.body_state import BodyUpdateState, excess
 from sim_server.updates.scheduler import (
-    UpdateRequest,
+    UpdateRequests,
     is_worthwhile,
     max_factor_age,
     overdue_after,
@@ -25,9 +25,41 @@ NEW, BUSY = None, True
 RULES = get_args(Rule)
 
 
-def requests(*rows: tuple) -> list[UpdateRequest]:
+@dataclasses.dataclass(frozen=True)
+class Row:
+    """What is known of one object, None where there is nothing yet."""
+
+    object: str
+    excess: float
+    waited: int | None
+    in_flight: bool
+    age: int | None = None
+    iteration_cost: float = 1.0
+    factorization_cost: float = 1.0
+    failures: int = 0
+    lost: float = 0.0
+    on_trial: bool = False
+    latest: float = 0.0
+
+
+def together(rows: list[Row]) -> UpdateRequests:
+    """As arrays; an object's number is its place."""
+    columns = ([getattr(r, f.name) for r in rows] for f in dataclasses.fields(UpdateRequests)[1:])
+    kinds = (float, int, bool, int, float, float, int, float, bool, float)
+    arrays = (
+        np.array([-1 if value is None else value for value in column], kind)
+        for column, kind in zip(columns, kinds, strict=True)
+    )
+    return UpdateRequests(np.arange(len(rows)), *arrays)
+
+
+def picked(rows: list[Row], *arguments, **options) -> list[str]:
+    return [rows[number].object for number in pick(together(rows), *arguments, **options)]
+
+
+def requests(*rows: tuple) -> list[Row]:
     """Rows (object, excess, waited, in flight)."""
-    return [UpdateRequest(*row) for row in rows]
+    return [Row(*row) for row in rows]
 
 
 STEPS = [  # iterations, linearizations, form, estimate; excess above a floor of 3 with an error bound of 0.02 m
@@ -78,10 +110,8 @@ WORTHWHILE = {
 @pytest.mark.parametrize("case", WORTHWHILE.values(), ids=WORTHWHILE.keys())
 def test_is_worthwhile(case):
     lost, cost, service, age, threshold, trial, expected = case
-    assert (
-        is_worthwhile(UpdateRequest("a", 0, 7, False, age, cost, service, lost=lost, on_trial=trial), threshold)
-        is expected
-    )
+    row = Row("a", 0, 7, False, age, cost, service, lost=lost, on_trial=trial)
+    assert is_worthwhile(together([row]), threshold).tolist() == [expected]
 
 
 def test_what_pays_makes_the_least_sum_of_lost_iterations_and_factorizations():
@@ -98,7 +128,9 @@ def test_what_pays_makes_the_least_sum_of_lost_iterations_and_factorizations():
         return spent
 
     best = min(total(lambda age, lost, every=every: age >= every) for every in range(1, 200))
-    found = total(lambda age, lost: is_worthwhile(UpdateRequest("a", 0, age, False, age, cost, service, lost=lost)))
+    found = total(
+        lambda age, lost: is_worthwhile(together([Row("a", 0, age, False, age, cost, service, lost=lost)]))[0]
+    )
     assert found < 1.02 * best
 
 
@@ -124,7 +156,7 @@ TABLE = {
 
 @pytest.mark.parametrize(("rows", "places", "floor", "expected"), TABLE.values(), ids=TABLE.keys())
 def test_pick(rows, places, floor, expected):
-    assert pick(requests(*rows), places, floor) == expected
+    assert picked(requests(*rows), places, floor) == expected
 
 
 def test_everybody_gets_a_turn():
@@ -132,7 +164,7 @@ def test_everybody_gets_a_turn():
     waited: dict[str, int | None] = dict.fromkeys("abc")
     order = []
     for _ in range(9):
-        chosen = pick(requests(*((name, 1.0, w, False) for name, w in waited.items())), 1)[0]
+        chosen = picked(requests(*((name, 1.0, w, False) for name, w in waited.items())), 1)[0]
         order.append(chosen)
         waited = {name: None if w is None else w + 1 for name, w in waited.items()}
         waited[chosen] = 1
@@ -145,14 +177,14 @@ def test_the_busy_do_not_starve_the_calm():
     for _ in range(60):
         sums["shaken"] += 20
         sums["calm"] += 1
-        chosen = pick(requests(*((name, s, 5, False) for name, s in sums.items())), 1)[0]
+        chosen = picked(requests(*((name, s, 5, False) for name, s in sums.items())), 1)[0]
         sums[chosen] = 0
         order.append(chosen)
     assert order.count("calm") == 2
 
 
-def request(object: str, **counters) -> UpdateRequest:
-    return UpdateRequest(**({"object": object, "excess": 0.0, "waited": 10, "in_flight": False, "age": 12} | counters))
+def request(object: str, **counters) -> Row:
+    return Row(**({"object": object, "excess": 0.0, "waited": 10, "in_flight": False, "age": 12} | counters))
 
 
 RULE_TABLE = {
@@ -169,7 +201,7 @@ RULE_TABLE = {
 
 @pytest.mark.parametrize(("rule", "rows", "expected"), RULE_TABLE.values(), ids=RULE_TABLE.keys())
 def test_rules(rule, rows, expected):
-    assert "".join(pick(rows, 9, rule=rule)) == expected
+    assert "".join(picked(rows, 9, rule=rule)) == expected
 
 
 @pytest.mark.parametrize("rule", RULES)
@@ -178,8 +210,8 @@ def test_whatever_the_rule(rule):
     rows = [request("wild", excess=1e9, waited=3, age=1000), request("late", waited=40), request("later", waited=41),
             request("new", waited=None, age=None), request("busy", excess=1e9, waited=90, in_flight=True),
             request("just", excess=1e9, waited=1, age=2000)]  # fmt: skip
-    assert pick(rows, 9, min_interval=2, rule=rule, overdue=40) == ["new", "later", "late", "wild"]
-    assert pick(rows, 2, min_interval=2, rule=rule, overdue=40) == ["new", "later"]
+    assert picked(rows, 9, min_interval=2, rule=rule, overdue=40) == ["new", "later", "late", "wild"]
+    assert picked(rows, 2, min_interval=2, rule=rule, overdue=40) == ["new", "later"]
 
 
 @pytest.mark.parametrize(
@@ -187,7 +219,7 @@ def test_whatever_the_rule(rule):
     [(0, 3, True), (1, 5, False), (1, 6, True), (2, 11, False), (99, 3 * 2**10 - 1, False), (99, 3 * 2**10, True)],
 )
 def test_an_object_whose_jobs_fail_is_asked_less_and_less_often(failures, waited, ready):
-    assert bool(pick([request("a", waited=waited, failures=failures)], 1, min_interval=3)) is ready
+    assert bool(picked([request("a", waited=waited, failures=failures)], 1, min_interval=3)) is ready
 
 
 def test_bounds_of_the_age():
@@ -208,7 +240,7 @@ def oldest_seen(rule: Rule, services: list[int], wild: dict[int, float], workers
             rows[k] = dataclasses.replace(rows[k], in_flight=False, age=rows[k].waited)
             del done[k]
         seen = max(seen, *(row.age or 0 for row in rows))
-        for name in pick(rows, workers - len(done), rule=rule, overdue=overdue):
+        for name in picked(rows, workers - len(done), rule=rule, overdue=overdue):
             k = int(name)
             done[k] = step + services[k]
             rows[k] = dataclasses.replace(rows[k], in_flight=True, waited=0, excess=0.0)

@@ -49,7 +49,7 @@ def _library() -> c.CDLL:
         "backends/cpu/native/loop.cpp",
         {
             "wf_assemble": (None, [loop]), "wf_solve": (None, [loop]), "wf_run": (c.c_int64, [loop, c.c_int64]),
-            "wf_wait": (c.c_int32, [loop]), "wf_restart": (None, [loop, c.c_int32]),
+            "wf_wait": (c.c_int32, [loop]), "wf_restart": (None, [loop, c.c_void_p, c.c_int32]),
             "wf_copy_matrix": (None, [loop, c.c_int32, p]), "wf_note_matrix": (None, [loop, c.c_int32]),
             "wf_post_factor": (p, [c.POINTER(structs.Body), p]), "wf_post_binding": (p, [c.POINTER(structs.Launch), p]),
             "wf_post_changes": (p, [loop, p]), "wf_take_changes": (None, [loop]),
@@ -505,7 +505,7 @@ class CpuEngine(Reports):
 
     capabilities = frozenset(Capability)
 
-    def __init__(self, given: EngineInput, records: int = 8192, frames: int = 8):
+    def __init__(self, given: EngineInput, records: int | None = None, frames: int = 8):
         self._native = _library()
         spawn = given.cut.spawn if given.cut else None
         others = [part.launches for part in (given.stages, given.euler, given.substeps, given.halving) if part]
@@ -691,8 +691,8 @@ class CpuEngine(Reports):
 
     def restart(self, bodies: Sequence[int]) -> None:
         """Begins the energy balances of bodies anew."""
-        for body in bodies:
-            self._native.wf_restart(c.byref(self.loop), body)
+        given = np.array(bodies, np.int32)
+        self._native.wf_restart(c.byref(self.loop), given.ctypes.data, len(given))
 
     def wait(self) -> bool:
         """Sleeps until the next step is due (real time) and while paused, as `run` does before each step.

@@ -86,7 +86,7 @@ class GpuEngine(DeviceLoop):
 
     capabilities: frozenset[Capability] = frozenset()
 
-    def __init__(self, gpu: Gpu, given: EngineInput, records: int = 8192):
+    def __init__(self, gpu: Gpu, given: EngineInput, records: int | None = None):
         assemble, integrate = (cast(Sequence[DeviceLaunch], part) for part in (given.assemble, given.integrate))
         self.launches, self._first = [*assemble, *integrate], assemble[: leading(assemble)]
         self._history = cast(Sequence[DeviceLaunch], given.history)

@@ -82,7 +82,7 @@ class DeviceLoop(Reports):
     def __init__(
         self, device: LoopDevice, ranges: Sequence[tuple[int, int]], row_start: NDArray[Any], dt: float,
         mailboxes: Sequence[tuple[int, int]], results: NDArray[Any], timestamps: NDArray[Any], clock: Float64,
-        records: int = 8192, real: DTypeLike = np.float64, newton_results: NDArray[Any] | None = None,
+        records: int | None = None, real: DTypeLike = np.float64, newton_results: NDArray[Any] | None = None,
         energy_records: NDArray[Any] | None = None, stage_results: NDArray[Any] | None = None,
         contact_results: NDArray[Any] | None = None, contact_reactions: NDArray[Any] | None = None,
         held_reactions: NDArray[Any] | None = None, substep_results: NDArray[Any] | None = None,

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from protocol.factor import Factor
 from sim_server.updates.body_state import BodyUpdateState
 from sim_server.updates.factor_source import Job
-from sim_server.updates.scheduler import UpdateRequest
+from sim_server.updates.scheduler import Flags, UpdateRequests
 
 if TYPE_CHECKING:
     from sim_server.updates.driver import Driver
@@ -34,8 +34,8 @@ class UpdatePolicy(ABC):
         """Makes one step, with the exchange of factors before and after it; none if the loop was stopped."""
 
     @abstractmethod
-    def wants(self, request: UpdateRequest, step: int) -> bool:
-        """True if the matrix of an object at a step is to be factorized."""
+    def wants(self, requests: UpdateRequests, step: int) -> Flags:
+        """True where the matrix of a body at a step is to be factorized."""
 
     @abstractmethod
     def max_age(self) -> int:

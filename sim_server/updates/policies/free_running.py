@@ -7,10 +7,20 @@ import time
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
+import numpy as np
+
+from sim_server.arrays import Float64
 from sim_server.updates.body_state import BodyUpdateState
 from sim_server.updates.policies.base import UpdatePolicy
 from sim_server.updates.prefetch import PrefetchDepth
-from sim_server.updates.scheduler import UpdateRequest, is_worthwhile, max_factor_age, overdue_after, pick
+from sim_server.updates.scheduler import (
+    Flags,
+    UpdateRequests,
+    is_worthwhile,
+    max_factor_age,
+    overdue_after,
+    pick,
+)
 
 if TYPE_CHECKING:
     from sim_server.updates.driver import Driver
@@ -39,7 +49,7 @@ class Async(UpdatePolicy):
         """Makes an exchange with the workers and adapts the prefetch depth to the time of steps."""
         driver = self.driver
         if self.prefetch.on_step(driver.engine.step, time.monotonic()) and not driver.counted:
-            self.prefetch.update([s.factors.cost.value for s in driver.bodies], driver.source.worker_count())
+            self.prefetch.update(driver.table.cost, driver.source.worker_count())
         self._exchange_copies()
         if (begin := time.monotonic()) >= self._choice_due:
             self._choose()  # of a thousand bodies it takes milliseconds: half of the time is kept for all else
@@ -66,30 +76,31 @@ class Async(UpdatePolicy):
         """Requests the matrices of the most urgent bodies."""
         driver, source, solver = self.driver, self.driver.source, self.driver.solver
         # Count the places: idle workers without a copy on the way, and copies to hold in advance
-        step, waiting = driver.engine.step, sum(s.job.copy is not None for s in driver.bodies)
+        step, waiting = driver.engine.step, int(driver.table.copying.sum())
         idle = max(min(source.ready(), MAX_REQUESTS) - waiting, 0)
         places = max(idle, self.prefetch.depth - waiting)
         if places <= 0 or step == self._exhausted:
             return
         # Choose the most urgent bodies, and leave the first of them to faster workers that are busy
-        requests = [r for r in self._requests() if self.wants(r, step)]
+        requests = self._requests()
+        requests = requests.of(self.wants(requests, step))
         left, interval = source.faster_busy_workers(), solver.update_floor_steps
         chosen = pick(requests, left + places, interval, solver.schedule, self._overdue())[left:]
         # Request their matrices; in advance only those of bodies that need a factor
-        states = [driver.by_name[name] for name in chosen]
+        states = [driver.bodies[body] for body in chosen]
         wanted = states[:idle] + [s for s in states[idle:] if s.job.sent is None or s.solves.excess > 0]
         for state in wanted:
             driver.snapshots.request(state)
         if len(wanted) < places:
             self._exhausted = step
 
-    def wants(self, request: UpdateRequest, step: int) -> bool:
-        """Returns True: the scheduler decides."""
-        return True
+    def wants(self, requests: UpdateRequests, step: int) -> Flags:
+        """Returns True for all: the scheduler decides."""
+        return np.ones(len(requests), np.bool_)
 
     def max_age(self) -> int:
         """Returns a bound by the latencies measured so far."""
-        if all(s.factors.latency.value is None for s in self.driver.bodies):
+        if np.isnan(self.driver.table.latency).all():
             return -1
         return max_factor_age(self._overdue(), self._latencies(), self.driver.source.worker_count())
 
@@ -97,20 +108,23 @@ class Async(UpdatePolicy):
         """Takes note that there is a body again whose matrix may be requested."""
         self._exhausted = -1
 
-    def _requests(self) -> list[UpdateRequest]:
+    def _requests(self) -> UpdateRequests:
         """Returns the requests of all bodies but frozen ones and those that are better left for a busy worker."""
         requests, source = self.driver.requests(), self.driver.source
         failures = source.consecutive_failures()
-        if failures is not None:
-            reserved = source.reserved()
-            if reserved or failures or any(r.failures for r in requests):
-                return [replace(r, failures=failures.get(r.object, 0)) for r in requests if r.object not in reserved]
-        return requests
+        if failures is None:
+            return requests
+        reserved = source.reserved()
+        if not (reserved or failures or requests.failures.any()):
+            return requests
+        names = [self.driver.bodies[body].body.name for body in requests.body.tolist()]
+        counted = replace(requests, failures=np.array([failures.get(name, 0) for name in names], np.int64))
+        return counted.of(np.array([name not in reserved for name in names], np.bool_))
 
     def _send_copies(self) -> None:
         """Sends copies to idle workers in the order of the requests. With a prefetch depth others wait their turn."""
         driver = self.driver
-        copied = driver.snapshots.completed(driver.bodies)
+        copied = driver.snapshots.completed()
         idle = driver.source.ready() if copied else 0
         for state in copied:
             waited = driver.engine.step - driver.snapshots.step(state)
@@ -134,20 +148,21 @@ class Async(UpdatePolicy):
         solver, workers = self.driver.solver, self.driver.source.worker_count()
         return max(overdue_after(solver.schedule_rounds, self._latencies(), workers), solver.update_floor_steps)
 
-    def _latencies(self) -> list[float]:
+    def _latencies(self) -> Float64:
         """Returns the steps from matrix to factor of each body; those not known yet are the mean of the others."""
-        values = [s.factors.latency.value for s in self.driver.bodies]
-        known = [v for v in values if v is not None]
-        mean = sum(known) / len(known) if known else 1.0
-        return [mean if v is None else v for v in values]
+        values = self.driver.table.latency
+        unknown = np.isnan(values)
+        if not unknown.any():
+            return values
+        return np.where(unknown, 1.0 if unknown.all() else values[~unknown].mean(), values)
 
 
 class Adaptive(Async):
     """As Async, but a matrix is sent only once the excess iterations have cost as much as a factorization."""
 
-    def wants(self, request: UpdateRequest, step: int) -> bool:
-        """True if a new factor is worth its time (scheduler.is_worthwhile)."""
-        return is_worthwhile(request, self.driver.solver.update_threshold)
+    def wants(self, requests: UpdateRequests, step: int) -> Flags:
+        """True where a new factor is worth its time (scheduler.is_worthwhile)."""
+        return is_worthwhile(requests, self.driver.solver.update_threshold)
 
     def max_age(self) -> int:
         """Returns -1: no age makes a factor too old."""

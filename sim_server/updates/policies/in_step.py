@@ -1,8 +1,10 @@
 # SPDX-License-Identifier: MIT
 """Policies whose factors are made in this process, within the step that waits for them."""
 
+import numpy as np
+
 from sim_server.updates.policies.base import UpdatePolicy
-from sim_server.updates.scheduler import UpdateRequest
+from sim_server.updates.scheduler import Flags, UpdateRequests
 
 
 class Never(UpdatePolicy):
@@ -13,14 +15,14 @@ class Never(UpdatePolicy):
     def step(self) -> None:
         """Makes a step. If a matrix is wanted, it is factorized between assembly and solve."""
         engine, requests = self.driver.engine, self.driver.requests()
-        if not any(self.wants(request, engine.step) for request in requests):
+        if not self.wants(requests, engine.step).any():
             engine.run(1)
         elif engine.wait():
             self.driver.solve_with_fresh_factors()
 
-    def wants(self, request: UpdateRequest, step: int) -> bool:
+    def wants(self, requests: UpdateRequests, step: int) -> Flags:
         """True at the first step."""
-        return step == 0
+        return np.full(len(requests), step == 0)
 
     def max_age(self) -> int:
         """Returns -1: the factor is as old as the run."""
@@ -30,9 +32,9 @@ class Never(UpdatePolicy):
 class Every(Never):
     """A factor at each n-th step."""
 
-    def wants(self, request: UpdateRequest, step: int) -> bool:
+    def wants(self, requests: UpdateRequests, step: int) -> Flags:
         """True at each n-th step."""
-        return step % self.n == 0
+        return np.full(len(requests), step % self.n == 0)
 
     def max_age(self) -> int:
         """Returns n - 1."""

@@ -8,11 +8,13 @@ import time
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from protocol.factor import Factor
 from sim_server.updates.body_state import BodyUpdateState
 from sim_server.updates.factor_source import Job
 from sim_server.updates.policies.base import UpdatePolicy
-from sim_server.updates.scheduler import UpdateRequest
+from sim_server.updates.scheduler import Flags, UpdateRequests
 
 if TYPE_CHECKING:
     from sim_server.updates.driver import Driver
@@ -48,7 +50,8 @@ class Lockstep(UpdatePolicy):
         for name, made in list(self._due.items()):
             if made + self.n == now:
                 self._use(name, made)
-        wanted = [driver.by_name[r.object] for r in driver.requests() if self.wants(r, now)]
+        requests = driver.requests()
+        wanted = [driver.bodies[body] for body in requests.body[self.wants(requests, now)].tolist()]
         for state in wanted:
             driver.snapshots.request(state)
         engine.run(1)
@@ -58,9 +61,10 @@ class Lockstep(UpdatePolicy):
             if self._send(state):
                 self._due[state.body.name] = now
 
-    def wants(self, request: UpdateRequest, step: int) -> bool:
-        """True if the object has no job."""
-        return request.object not in self._due
+    def wants(self, requests: UpdateRequests, step: int) -> Flags:
+        """True where the body has no job."""
+        bodies = self.driver.bodies
+        return np.array([bodies[body].body.name not in self._due for body in requests.body.tolist()], np.bool_)
 
     def max_age(self) -> int:
         """Returns 2 n - 1: a factor is n steps old when it comes, and stays for n steps."""

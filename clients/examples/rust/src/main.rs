@@ -20,7 +20,7 @@ type Result<T> = std::result::Result<T, Box<dyn std::error::Error + Send + Sync>
 const USAGE: &str = "usage: warpfactor-client OBJECT [DX DY DZ [SECONDS]]
 grabs OBJECT at its tip and moves the grab by this vector [m] (0 0.5 0) in that time [s of wall clock] (2)
 WARPFACTOR_CONNECT=tcp/HOST:PORT says where the server is, by default tcp/127.0.0.1:7447";
-const PROTOCOL: u32 = 1; // version of the wire, in each header
+const PROTOCOL: u32 = 2; // version of the wire, in each header
 const SERVER: &str = "sim"; // its name in all keys
 const TIMEOUT: Duration = Duration::from_secs(5); // of connecting and of each answer
 const PERIOD: Duration = Duration::from_millis(10); // of moves

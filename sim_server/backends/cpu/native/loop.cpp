@@ -389,12 +389,14 @@ int64_t wf_run(Loop* loop, int64_t steps) {
     return done;
 }
 
-// Begins the energy balance of a body that was put back to its start, also of a frozen one.
-void wf_restart(Loop* loop, int32_t body) {
+// Begins the energy balances of bodies that were put back to their start, also of frozen ones.
+void wf_restart(Loop* loop, const int32_t* bodies, int32_t count) {
     if (!loop->energies) return;
     measure_elastic(*loop);
-    loop->energies->balance[body].phase = WELL;
-    begin_balance(*loop, loop->body[body], loop->energies->balance[body]);
+    for (int k = 0; k < count; ++k) {
+        loop->energies->balance[bodies[k]].phase = WELL;
+        begin_balance(*loop, loop->body[bodies[k]], loop->energies->balance[bodies[k]]);
+    }
 }
 
 const Factor* wf_post_factor(Body* body, const Factor* factor) { return body->mail.exchange(factor); }
