@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from protocol.factor import FactorPattern
+from protocol.factor import Factor, FactorPattern
 from sim_server.arrays import Float64, Int32
 from sim_server.backends.state import StateArray
 
@@ -240,6 +240,9 @@ class Engine(Protocol):
         """Takes a factor of the matrix of `step`, whose values do not change any more; one of the next solves of the
         body takes it up."""
         ...
+
+    def post_factors(self, bodies: Sequence[int], factors: Sequence[Factor]) -> None:
+        """Posts factors of different bodies, one of each."""
 
     def prepare_for_factors(self) -> None:
         """Begins what the first factor would wait for, without waiting."""
