@@ -327,6 +327,8 @@ class Worker:
                 answer.checksum = checksum(values)
                 payload = b"" if in_slot else values.tobytes()
         connection.send_factor(answer, payload)
+        if values is not None:
+            self._counters.add("factors")
 
     def _answer_together(
         self, job: Job, batch: Batch, pattern: FactorPattern | None, values: NDArray[Any] | None, seconds: float,
