@@ -110,6 +110,8 @@ class Telemetry:
 
         resumed: where the run goes on; the log has it, too, so that it can be repeated
         """
+        import scipy.spatial  # noqa: F401  for tips; on a busy machine the first status would wait seconds for it
+
         message = messages.scene(self.simulation)
         message.server = self.link.name
         self.link.set_scene(messages.published(message))
