@@ -235,8 +235,78 @@ class Factor(_message.Message):
     remedy: str
     def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., step: _Optional[int] = ..., warp: _Optional[bool] = ..., pattern: _Optional[int] = ..., dtype: _Optional[str] = ..., nonzeros: _Optional[int] = ..., checksum: _Optional[int] = ..., slot: _Optional[_Union[Slot, _Mapping]] = ..., worker: _Optional[str] = ..., seconds: _Optional[float] = ..., failure: _Optional[str] = ..., job: _Optional[int] = ..., matrix_shared: _Optional[bool] = ..., remedy: _Optional[str] = ...) -> None: ...
 
+class MatrixBatch(_message.Message):
+    __slots__ = ("header", "worker", "factor_dtype", "method", "drop_tolerance", "fill", "omega", "matrix_slot", "factor_slot", "objects", "epochs", "jobs", "steps", "warps", "blocks", "checksums", "rooms", "leases", "known", "known_patterns")
+    HEADER_FIELD_NUMBER: _ClassVar[int]
+    WORKER_FIELD_NUMBER: _ClassVar[int]
+    FACTOR_DTYPE_FIELD_NUMBER: _ClassVar[int]
+    METHOD_FIELD_NUMBER: _ClassVar[int]
+    DROP_TOLERANCE_FIELD_NUMBER: _ClassVar[int]
+    FILL_FIELD_NUMBER: _ClassVar[int]
+    OMEGA_FIELD_NUMBER: _ClassVar[int]
+    MATRIX_SLOT_FIELD_NUMBER: _ClassVar[int]
+    FACTOR_SLOT_FIELD_NUMBER: _ClassVar[int]
+    OBJECTS_FIELD_NUMBER: _ClassVar[int]
+    EPOCHS_FIELD_NUMBER: _ClassVar[int]
+    JOBS_FIELD_NUMBER: _ClassVar[int]
+    STEPS_FIELD_NUMBER: _ClassVar[int]
+    WARPS_FIELD_NUMBER: _ClassVar[int]
+    BLOCKS_FIELD_NUMBER: _ClassVar[int]
+    CHECKSUMS_FIELD_NUMBER: _ClassVar[int]
+    ROOMS_FIELD_NUMBER: _ClassVar[int]
+    LEASES_FIELD_NUMBER: _ClassVar[int]
+    KNOWN_FIELD_NUMBER: _ClassVar[int]
+    KNOWN_PATTERNS_FIELD_NUMBER: _ClassVar[int]
+    header: Header
+    worker: str
+    factor_dtype: str
+    method: str
+    drop_tolerance: float
+    fill: float
+    omega: float
+    matrix_slot: Slot
+    factor_slot: Slot
+    objects: _containers.RepeatedScalarFieldContainer[str]
+    epochs: _containers.RepeatedScalarFieldContainer[int]
+    jobs: _containers.RepeatedScalarFieldContainer[int]
+    steps: _containers.RepeatedScalarFieldContainer[int]
+    warps: _containers.RepeatedScalarFieldContainer[bool]
+    blocks: _containers.RepeatedScalarFieldContainer[int]
+    checksums: _containers.RepeatedScalarFieldContainer[int]
+    rooms: _containers.RepeatedScalarFieldContainer[int]
+    leases: _containers.RepeatedScalarFieldContainer[float]
+    known: _containers.RepeatedScalarFieldContainer[int]
+    known_patterns: _containers.RepeatedScalarFieldContainer[int]
+    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., worker: _Optional[str] = ..., factor_dtype: _Optional[str] = ..., method: _Optional[str] = ..., drop_tolerance: _Optional[float] = ..., fill: _Optional[float] = ..., omega: _Optional[float] = ..., matrix_slot: _Optional[_Union[Slot, _Mapping]] = ..., factor_slot: _Optional[_Union[Slot, _Mapping]] = ..., objects: _Optional[_Iterable[str]] = ..., epochs: _Optional[_Iterable[int]] = ..., jobs: _Optional[_Iterable[int]] = ..., steps: _Optional[_Iterable[int]] = ..., warps: _Optional[_Iterable[bool]] = ..., blocks: _Optional[_Iterable[int]] = ..., checksums: _Optional[_Iterable[int]] = ..., rooms: _Optional[_Iterable[int]] = ..., leases: _Optional[_Iterable[float]] = ..., known: _Optional[_Iterable[int]] = ..., known_patterns: _Optional[_Iterable[int]] = ...) -> None: ...
+
+class FactorBatch(_message.Message):
+    __slots__ = ("header", "worker", "jobs", "patterns", "nonzeros", "checksums", "seconds", "failures", "remedies", "slot", "matrix_shared")
+    HEADER_FIELD_NUMBER: _ClassVar[int]
+    WORKER_FIELD_NUMBER: _ClassVar[int]
+    JOBS_FIELD_NUMBER: _ClassVar[int]
+    PATTERNS_FIELD_NUMBER: _ClassVar[int]
+    NONZEROS_FIELD_NUMBER: _ClassVar[int]
+    CHECKSUMS_FIELD_NUMBER: _ClassVar[int]
+    SECONDS_FIELD_NUMBER: _ClassVar[int]
+    FAILURES_FIELD_NUMBER: _ClassVar[int]
+    REMEDIES_FIELD_NUMBER: _ClassVar[int]
+    SLOT_FIELD_NUMBER: _ClassVar[int]
+    MATRIX_SHARED_FIELD_NUMBER: _ClassVar[int]
+    header: Header
+    worker: str
+    jobs: _containers.RepeatedScalarFieldContainer[int]
+    patterns: _containers.RepeatedScalarFieldContainer[int]
+    nonzeros: _containers.RepeatedScalarFieldContainer[int]
+    checksums: _containers.RepeatedScalarFieldContainer[int]
+    seconds: _containers.RepeatedScalarFieldContainer[float]
+    failures: _containers.RepeatedScalarFieldContainer[str]
+    remedies: _containers.RepeatedScalarFieldContainer[str]
+    slot: Slot
+    matrix_shared: bool
+    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., worker: _Optional[str] = ..., jobs: _Optional[_Iterable[int]] = ..., patterns: _Optional[_Iterable[int]] = ..., nonzeros: _Optional[_Iterable[int]] = ..., checksums: _Optional[_Iterable[int]] = ..., seconds: _Optional[_Iterable[float]] = ..., failures: _Optional[_Iterable[str]] = ..., remedies: _Optional[_Iterable[str]] = ..., slot: _Optional[_Union[Slot, _Mapping]] = ..., matrix_shared: _Optional[bool] = ...) -> None: ...
+
 class WorkerInfo(_message.Message):
-    __slots__ = ("header", "worker", "pid", "host", "library", "threads", "shared_memory", "jobs", "failures", "superseded", "refused", "bulk_shared", "bulk_copied", "builds", "idle", "share", "leaving", "most_jobs")
+    __slots__ = ("header", "worker", "pid", "host", "library", "threads", "shared_memory", "jobs", "failures", "superseded", "refused", "bulk_shared", "bulk_copied", "builds", "idle", "share", "leaving", "most_jobs", "batches")
     HEADER_FIELD_NUMBER: _ClassVar[int]
     WORKER_FIELD_NUMBER: _ClassVar[int]
     PID_FIELD_NUMBER: _ClassVar[int]
@@ -255,6 +325,7 @@ class WorkerInfo(_message.Message):
     SHARE_FIELD_NUMBER: _ClassVar[int]
     LEAVING_FIELD_NUMBER: _ClassVar[int]
     MOST_JOBS_FIELD_NUMBER: _ClassVar[int]
+    BATCHES_FIELD_NUMBER: _ClassVar[int]
     header: Header
     worker: str
     pid: int
@@ -273,7 +344,8 @@ class WorkerInfo(_message.Message):
     share: float
     leaving: bool
     most_jobs: int
-    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., worker: _Optional[str] = ..., pid: _Optional[int] = ..., host: _Optional[str] = ..., library: _Optional[str] = ..., threads: _Optional[int] = ..., shared_memory: _Optional[bool] = ..., jobs: _Optional[int] = ..., failures: _Optional[int] = ..., superseded: _Optional[int] = ..., refused: _Optional[int] = ..., bulk_shared: _Optional[int] = ..., bulk_copied: _Optional[int] = ..., builds: _Optional[bool] = ..., idle: _Optional[bool] = ..., share: _Optional[float] = ..., leaving: _Optional[bool] = ..., most_jobs: _Optional[int] = ...) -> None: ...
+    batches: bool
+    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., worker: _Optional[str] = ..., pid: _Optional[int] = ..., host: _Optional[str] = ..., library: _Optional[str] = ..., threads: _Optional[int] = ..., shared_memory: _Optional[bool] = ..., jobs: _Optional[int] = ..., failures: _Optional[int] = ..., superseded: _Optional[int] = ..., refused: _Optional[int] = ..., bulk_shared: _Optional[int] = ..., bulk_copied: _Optional[int] = ..., builds: _Optional[bool] = ..., idle: _Optional[bool] = ..., share: _Optional[float] = ..., leaving: _Optional[bool] = ..., most_jobs: _Optional[int] = ..., batches: _Optional[bool] = ...) -> None: ...
 
 class Need(_message.Message):
     __slots__ = ("header", "lost", "workers")

@@ -62,8 +62,12 @@ class Slot:
 
     def array(self, dtype: DTypeLike, count: int) -> NDArray[Any]:
         """Returns the first `count` values of the slot, in place."""
+        return self.part(0, dtype, count)
+
+    def part(self, first: int, dtype: DTypeLike, count: int) -> NDArray[Any]:
+        """Returns `count` values from the byte `first` on, in place."""
         kind = np.dtype(dtype)
-        return self._bytes[HEADER : HEADER + count * kind.itemsize].view(kind)
+        return self._bytes[HEADER + first : HEADER + first + count * kind.itemsize].view(kind)
 
     def message(self) -> SlotMessage:
         """Describes the slot for a borrower on this host."""

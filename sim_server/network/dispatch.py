@@ -4,7 +4,7 @@
 import logging
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import partial
 
@@ -16,10 +16,12 @@ from protocol.counters import Counters
 from protocol.factor import Factor, FactorPattern
 from protocol.messages_pb2 import Factor as FactorMessage
 from protocol.messages_pb2 import Topology, WorkerInfo
+from protocol.method import Method
 from protocol.refused import Refused
 from protocol.shared_memory.pool import Slot, SlotPool
 from protocol.validate import take
-from sim_server.network.factor_decoder import FactorDecoder
+from sim_server.network.batch_message import MOST_TOGETHER, Entry, batch_message, entries_of, group
+from sim_server.network.factor_decoder import AnnouncedObject, FactorDecoder
 from sim_server.network.inbox import Inbox
 from sim_server.network.job_message import add_values, matrix_message
 from sim_server.network.leases import MAX_EXPIRED, InFlightJob, Leases
@@ -87,6 +89,7 @@ class Dispatch(FactorSource):
             "worker": self._on_heartbeat,
             "pattern": self._on_pattern,
             "factor": self._on_factor,
+            "factors": self._on_factors,
             "alive_worker": self._on_token,
         }
 
@@ -158,7 +161,8 @@ class Dispatch(FactorSource):
         with self._lock:
             now = self._clock()
             idle = [(name, now - self._free_since.get(name, 0.0)) for name in self._open()]
-            busy = [(j.worker, j.object, now - j.sent_at) for j in self.leases.jobs if not self._room(j.worker)]
+            full = {name for name in self.leases.by_worker if not self._room(name)}
+            busy = [(j.worker, j.object, now - j.sent_at) for j in self.leases.jobs if j.worker in full]
             return self._timing.faster_busy_workers(idle, busy)
 
     def reassigned(self) -> list[str]:
@@ -199,23 +203,140 @@ class Dispatch(FactorSource):
     def submit(self, job: Job) -> bool:
         """Sends a job to a worker with room; False if there is none or the object has a job in flight."""
         with self._lock:
+            self._receive()
             return self._submit(job)
 
-    def _submit(self, job: Job) -> bool:
+    def submit_many(self, jobs: Sequence[Job]) -> list[bool]:
+        """Sends jobs of different objects, the most urgent first, those of small objects to one worker in one message.
+
+        False for those for which no worker has room, or whose object has a job in flight.
+        """
+        with self._lock:
+            self._receive()
+            return self._submit_many(jobs)
+
+    def _submit_many(self, jobs: Sequence[Job]) -> list[bool]:
+        taken = [False] * len(jobs)
+        batches: dict[tuple[str, tuple[str, Method]], list[int]] = {}  # places of jobs by worker and what they share
+        rooms = {name: self._room(name) for name in self._open()} if len(jobs) > 1 else {}
+        for place, job in enumerate(jobs):
+            idle = [name for name, room in rooms.items() if room > 0]
+            worker = self._worker_for(job, idle, rooms) if idle else None
+            if worker is None or not self._may_batch(job, worker):
+                taken[place] = self._submit(job)
+                rooms = {name: self._room(name) for name in self._open()}
+                for (name, _), places in batches.items():
+                    rooms[name] = rooms.get(name, 0) - len(places)
+            else:
+                rooms[worker] -= 1
+                batches.setdefault((worker, group(job)), []).append(place)
+        for (worker, _), places in batches.items():
+            for k in range(0, len(places), MOST_TOGETHER):
+                part = places[k : k + MOST_TOGETHER]
+                for place, sent in zip(part, self._send_batch(worker, [jobs[p] for p in part]), strict=True):
+                    taken[place] = sent
+        return taken
+
+    def _worker_for(self, job: Job, idle: list[str], rooms: Mapping[str, int]) -> str | None:
+        """Chooses a worker of those with room; None if there is none or the object has a job in flight."""
+        self._check_job(job)
+        if job.object in self.leases.by_object:
+            return None
+        able = [name for name in idle if not job.positions or self._assembles(name)]
+        if self._reliability.failing_objects:
+            able = self._candidates(able, self._available(), job.object)
+        return self._choose(able, job.object, rooms) if able else None
+
+    def _may_batch(self, job: Job, worker: str) -> bool:
+        """True if a job of the worker may share a message with others: its object is small, and the size of its factor
+        is known."""
+        info = self._registry.info(worker)
+        return (
+            not job.positions
+            and job.method.name in self.decoder.objects[job.object].largest
+            and job.method.name != "incomplete_cholesky"  # the next factor may be larger
+            and info is not None
+            and info.batches
+            and self._room(worker) > 1
+            and self._has_slots(worker)
+        )
+
+    def _send_batch(self, worker: str, jobs: Sequence[Job]) -> list[bool]:
+        """Sends jobs to a worker in one message, or one by one if there are no slots for them together."""
+        slots = None
+        if len(jobs) > 1:
+            entries = entries_of([(job, self.decoder.objects[job.object]) for job in jobs])
+            slots = self._allocate_batch(entries)
+        if slots is None:
+            return [self._submit_to(worker, job) for job in jobs]
+        leases = [self.leases.lease(job.object, worker, job.method.name) for job in jobs]
+        in_flight = [
+            self._begin_job(job, worker, lease, slots, factor_slot=slots[1], first=entry.first, room=entry.room)
+            for job, lease, entry in zip(jobs, leases, entries, strict=True)
+        ]
+        message = batch_message(entries, in_flight, leases, self._incarnation, *slots)
+        name, attachment = key("matrices", self._server, worker=worker), message.SerializeToString()
+        payload = slots[0].payload
+        if self._queue.post(lambda: self._send(in_flight, name, payload, attachment, True)):
+            self._on_sent(worker, jobs)
+            return [True] * len(jobs)
+        for job in in_flight:
+            self.leases.cancel(job)
+        return [False] * len(jobs)
+
+    def _allocate_batch(self, entries: Sequence[Entry]) -> tuple[Slot, Slot] | None:
+        """Allocates a slot for matrices and one for factors; None if there is not enough shared memory."""
+        assert self._pool is not None
+        matrices = self._pool.lend(sum(entry.job.values.nbytes for entry in entries), len(entries))
+        factors = self._pool.lend(entries[-1].first + entries[-1].room, len(entries))
+        if matrices is not None and factors is not None:
+            return matrices, factors
+        for slot in filter(None, (matrices, factors)):
+            for _ in entries:
+                self._pool.give_back(slot)
+        return None
+
+    def _on_sent(self, worker: str, jobs: Sequence[Job]) -> None:
+        for job in jobs:
+            self._last_worker[job.object] = worker
+        self._reliability.on_sent(worker, self._clock())
+        self._counters.add("jobs", len(jobs))
+        self._counters.add("bytes_out", sum(job.values.nbytes for job in jobs))
+
+    def _check_job(self, job: Job) -> AnnouncedObject:
         known = self.decoder.objects.get(job.object)
         if known is None or known.epoch != job.epoch:
             raise ValueError(f"job for {job.object} epoch {job.epoch}, which was not announced")
         shape = (known.size // 3, 3) if job.positions else (known.blocks, 3, 3)
         if job.values.shape != shape or job.values.dtype != np.float64:
             raise ValueError(f"job for {job.object}: values {job.values.shape}, allowed: float64 {shape}")
-        self._receive()
+        return known
+
+    def _submit(self, job: Job) -> bool:
+        self._check_job(job)
         idle = [name for name in self._open() if not job.positions or self._assembles(name)]
         idle = self._candidates(idle, self._available(), job.object)
         if job.object in self.leases.by_object or not idle:
             return False
-        worker = self._choose(idle, job.object)
+        return self._submit_to(self._choose(idle, job.object), job)
+
+    def _submit_to(self, worker: str, job: Job) -> bool:
+        """Sends a job alone."""
         matrix_slot, factor_slot = self._allocate_slots(worker, job)
         lease = self.leases.lease(job.object, worker, job.method.name, job.positions)
+        slots = tuple(slot for slot in (matrix_slot, factor_slot) if slot is not None)
+        payload_bytes = 0 if matrix_slot else job.values.nbytes
+        in_flight = self._begin_job(job, worker, lease, slots, factor_slot=factor_slot, payload_bytes=payload_bytes)
+        if self._post(in_flight, job, lease, matrix_slot):
+            self._on_sent(worker, [job])
+            return True
+        self.leases.cancel(in_flight)
+        return False
+
+    def _begin_job(
+        self, job: Job, worker: str, lease: float, slots: tuple[Slot, ...], factor_slot: Slot | None, **more: int
+    ) -> InFlightJob:
+        """Begins the lease of a job that is being sent. more: fields of InFlightJob"""
         now = self._clock()
         in_flight = InFlightJob(
             self.leases.next_number(),
@@ -228,22 +349,15 @@ class Dispatch(FactorSource):
             deadline=now + lease,
             factor_slot=factor_slot,
             factor_generation=factor_slot.generation if factor_slot else 0,
-            slots=tuple(slot for slot in (matrix_slot, factor_slot) if slot is not None),
+            slots=slots,
             sent_at=now,
-            exclusive_until=now + self.leases.exclusive_period(job.object, known.blocks),
+            exclusive_until=now + self.leases.exclusive_period(job.object, self.decoder.objects[job.object].blocks),
             method=job.method.name,
-            payload_bytes=0 if matrix_slot else job.values.nbytes,
             positions=job.positions,
+            **more,
         )
         self.leases.start(in_flight)
-        if self._post(in_flight, job, lease, matrix_slot):
-            self._last_worker[job.object] = worker
-            self._reliability.on_sent(worker, now)
-            self._counters.add("jobs")
-            self._counters.add("bytes_out", job.values.nbytes)
-            return True
-        self.leases.cancel(in_flight)
-        return False
+        return in_flight
 
     def _available(self) -> list[str]:
         return self._registry.available(self._clock(), self.leases.deadlines())
@@ -282,12 +396,18 @@ class Dispatch(FactorSource):
         info = self._registry.info(worker)
         return info is not None and info.builds
 
-    def _choose(self, idle: list[str], object: str) -> str:
+    def _choose(self, idle: list[str], object: str, rooms: Mapping[str, int] | None = None) -> str:
         """Chooses the worker with the fewest expired jobs; then the one that would be done first, the one with the
-        fewest jobs in flight, the last of the object, the least used."""
+        fewest jobs in flight, the last of the object, the least used.
+
+        rooms: jobs that workers can take besides those that are about to be sent; None: none is
+        """
+        if len(idle) == 1:
+            return idle[0]
 
         def rank(name: str) -> tuple[int, float, int, bool, int]:
             info, waiting = self._registry.info(name), self.leases.count(name)
+            waiting += 0 if rooms is None else self._room(name) - rooms[name]
             expired, expected = self.leases.expired_count(name), self._timing.expected(name, object)
             other = self._last_worker.get(object) != name
             return expired, (1 + waiting) * expected, waiting, other, info.jobs if info else 0
@@ -296,9 +416,7 @@ class Dispatch(FactorSource):
 
     def _allocate_slots(self, worker: str, job: Job) -> tuple[Slot | None, Slot | None]:
         """Allocates slots for the matrix and its factor; None for an array that must travel as bytes."""
-        info = self._registry.info(worker)
-        unfit = info is None or not info.shared_memory or self.leases.expired_count(worker) >= MAX_EXPIRED
-        if self._pool is None or unfit:
+        if self._pool is None or not self._has_slots(worker):
             return None, None
         nonzeros = self.decoder.objects[job.object].largest.get(job.method.name, 0)
         if job.method.name == "incomplete_cholesky":
@@ -309,31 +427,41 @@ class Dispatch(FactorSource):
             self._counters.trouble("slots_exhausted", "no slot of shared memory is left, an array travels as bytes")
         return matrix, factor
 
+    def _has_slots(self, worker: str) -> bool:
+        """True if arrays may travel to and from a worker in slots of shared memory."""
+        info = self._registry.info(worker)
+        unfit = info is None or not info.shared_memory or self.leases.expired_count(worker) >= MAX_EXPIRED
+        return self._pool is not None and not unfit
+
     def _post(self, in_flight: InFlightJob, job: Job, lease: float, slot: Slot | None) -> bool:
         known = self.decoder.objects[job.object]
         message = matrix_message(in_flight, known, self._incarnation, lease, job.method)
         payload = add_values(message, job.values, slot)
         name = key("matrix", self._server, worker=in_flight.worker, object=in_flight.object)
         attachment = message.SerializeToString()
-        return self._queue.post(lambda: self._send(in_flight, name, payload, attachment, slot is not None))
+        return self._queue.post(lambda: self._send([in_flight], name, payload, attachment, slot is not None))
 
-    def _send(self, job: InFlightJob, name: str, payload: zenoh.ZBytes, attachment: bytes, shared: bool) -> None:
-        """Sends a job, in the thread of the send queue. If a link is full, zenoh drops the job or blocks.
+    def _send(
+        self, jobs: Sequence[InFlightJob], name: str, payload: zenoh.ZBytes, attachment: bytes, shared: bool
+    ) -> None:  # fmt: skip
+        """Sends a job or a batch of them, in the thread of the send queue. If a link is full, zenoh drops it or blocks.
 
         A dropped job ends its lease. zenoh blocks only for bytes over a link that is not known to be fast, since a
         slow link takes longer than zenoh would keep them. While it blocks for one receiver all others wait too, even
         for a receiver that subscribed to everything and stopped reading. The priority is one of its own, since a
         blocked message locks the queue of its priority.
         """
-        drop = shared or job.worker in self._fast_links
+        worker = jobs[0].worker
+        drop = shared or worker in self._fast_links
         control = zenoh.CongestionControl.DROP if drop else zenoh.CongestionControl.BLOCK
         begin = time.perf_counter()
         self._session.put(
             name, payload, attachment=attachment, congestion_control=control, priority=zenoh.Priority.BACKGROUND
         )
         if not drop and time.perf_counter() - begin < FAST_SEND:
-            self._fast_links.add(job.worker)
-        self._sent[job.number] = self._clock()
+            self._fast_links.add(worker)
+        for job in jobs:
+            self._sent[job.number] = self._clock()
 
     # ---- messages from workers -------------------------------------------------------------------------------
 
@@ -423,7 +551,30 @@ class Dispatch(FactorSource):
                 raise Refused(f"Factor.job is {job.number}, already answered", "duplicate")
             self._decoding.append((message, job, self._thread.submit(decode)))
             return
-        self._take_factor(message, job, decode)
+        self._take_factor(job, decode, message.failure, message.seconds, _slots_used(message))
+
+    def _on_factors(self, sample: zenoh.Sample) -> None:
+        """Takes answers to jobs of a batch, each by itself: what is wrong with one costs the others nothing."""
+        message = self.decoder.parse_batch(sample.key_expr, sample.attachment)
+        now, worker = self._clock(), message.worker
+        self._registry.mark_seen(worker, now)
+        duration: float | None = None
+        for place, number in enumerate(message.jobs):
+            try:
+                job = self.leases.match_answer(number, worker, None)
+                failure = message.failures[place] if message.failures else ""
+                if duration is None:
+                    duration = self._duration(job, now) / len(message.jobs)
+                    self._free_since[worker] = now
+                    self._reliability.on_answer(worker)
+                if self.leases.is_reassigned(job):
+                    self.leases.finish(job, None if failure else message.seconds[place])
+                    continue
+                decode = partial(self.decoder.decode_one, message, place, job)
+                by_slot = message.matrix_shared, True
+                self._take_factor(job, decode, failure, message.seconds[place], by_slot, duration)
+            except Refused as refusal:
+                self._counters.refuse(refusal)
 
     def _is_decoded(self, job: InFlightJob) -> bool:
         """True while the answer to a job is decoded beside the caller."""
@@ -440,21 +591,31 @@ class Dispatch(FactorSource):
                 if self.leases.is_reassigned(current):
                     self.leases.finish(current, message.seconds)
                 else:
-                    self._take_factor(message, current, factor.result)
+                    told = message.failure, message.seconds, _slots_used(message)
+                    self._take_factor(current, factor.result, *told)
             except Refused as refusal:
                 self._counters.refuse(refusal)
 
-    def _take_factor(self, message: FactorMessage, job: InFlightJob, decode: Callable[[], Factor]) -> None:
-        """Takes the answer to a job: the factor that `decode` returns, or a failure."""
+    def _take_factor(
+        self, job: InFlightJob, decode: Callable[[], Factor], failure: str, told: float, by_slot: tuple[bool, bool],
+        duration: float | None = None,
+    ) -> None:  # fmt: skip
+        """Takes the answer to a job: the factor that `decode` returns, or a failure.
+
+        told: time [s] of the factorization, by the worker
+        by_slot: matrix and factor travelled in shared memory
+        duration: from matrix to factor [s]; None: until now
+        """
         now, seconds = self._clock(), None
         try:
-            if message.failure:
+            if failure:
                 self._counters.add("failures")
                 self._reliability.on_failure(job.worker, job.object, now)
-                return self._fail(job, f"failed: {message.failure}")
+                return self._fail(job, f"failed: {failure[:500]}")
             self._factors.append(decode())
-            seconds = message.seconds
-            self._timing.record(job.worker, job.object, self._duration(job, now), seconds)
+            seconds = told
+            lasted = self._duration(job, now) if duration is None else duration
+            self._timing.record(job.worker, job.object, lasted, seconds)
         except Refused as refusal:
             self._reliability.on_failure(job.worker, job.object, now)
             self._fail(job, f"was refused: {refusal}")
@@ -465,8 +626,8 @@ class Dispatch(FactorSource):
         self._counters.add("bytes_in", self._factors[-1].values.nbytes)
         capacity = job.factor_slot.capacity if job.factor_slot is not None else 0
         fits = 0 < self._factors[-1].values.nbytes <= capacity  # an incomplete factor may be the largest so far
-        self._count_bulk("matrix", job, message.matrix_shared, bool(job.slots))
-        self._count_bulk("factor", job, message.HasField("slot"), fits)
+        self._count_bulk("matrix", job, by_slot[0], bool(job.slots))
+        self._count_bulk("factor", job, by_slot[1], fits)
 
     def _duration(self, job: InFlightJob, now: float) -> float:
         """Time [s] from matrix to factor, without that for which the job waited behind others of its worker."""
@@ -482,3 +643,8 @@ class Dispatch(FactorSource):
 
     def _fail(self, job: InFlightJob, why: str) -> None:
         self._failures.append((job.object, f"factorization of {job.object} at step {job.step} {why}"))
+
+
+def _slots_used(message: FactorMessage) -> tuple[bool, bool]:
+    """Whether matrix and factor travelled in shared memory."""
+    return message.matrix_shared, message.HasField("slot")

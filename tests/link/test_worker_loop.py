@@ -58,7 +58,7 @@ class FakeConnection:
     """The network as the worker sees it; answers and patterns pile up here."""
 
     def __init__(self) -> None:
-        self.name, self.incarnation, self.library = "w", 0, ""
+        self.name, self.server, self.incarnation, self.library = "w", "sim", 0, ""
         self.counters = Counters(logging.getLogger("test"))
         self.received: ReceiveQueue[Any] = ReceiveQueue(8)
         self.slots = SlotMap()

@@ -16,7 +16,7 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from protocol.factor import FactorPattern
+from protocol.factor import Factor, FactorPattern
 from sim_server.arrays import Int32
 from sim_server.backends.base import ArrayChange, Capability, CutInput, EngineInput, Launch
 from sim_server.backends.central_difference import NODAL as NODAL_OF_SUBSTEPS
@@ -770,6 +770,11 @@ class CpuEngine(Reports):
         buffer.fill(values, step)
         self._mail[body].waiting = buffer
         self._native.wf_post_factor(c.byref(self._body[body]), buffer.address)
+
+    def post_factors(self, bodies: Sequence[int], factors: Sequence[Factor]) -> None:
+        """Posts factors of different bodies, one of each."""
+        for body, factor in zip(bodies, factors, strict=True):
+            self.post_factor(body, factor.pattern, factor.values, factor.step)
 
     def prepare_for_factors(self) -> None:
         """Does nothing."""
