@@ -12,12 +12,14 @@ import zenoh
 from numpy.typing import NDArray
 
 from precond_worker.arrays import Int32
+from precond_worker.batch import Batch, BatchAnswer
 from precond_worker.errors import DeviceUnusable, NameTaken
 from precond_worker.factorization.registry import Factorization
 from precond_worker.job import Job, accept
 from precond_worker.network.presence import ServerGone, ServersThere
 from precond_worker.network.server_connection import ServerConnection
 from precond_worker.remote_assembly import Assemblers
+from protocol.channels import WHOLE_PARTS
 from protocol.factor import FactorPattern
 from protocol.messages_pb2 import Factor
 from protocol.method import Method
@@ -27,6 +29,7 @@ from protocol.validate import array, checksum
 
 log = logging.getLogger(__name__)
 
+ANSWER_SECONDS = 3e-3  # s for which answers wait for others of their batch
 
 Analyse = Callable[[Int32, Int32, Method], Factorization]  # registry.make_factorization
 
@@ -57,6 +60,7 @@ class Worker:
         self._patterns: WeakValueDictionary[tuple[bytes, bytes], Factorization] = WeakValueDictionary()
         self._assemblers = Assemblers(connection)
         self._pending: dict[str, Job] = {}
+        self._answers: dict[int, BatchAnswer] = {}  # by id of the batch; sent before a batch is forgotten
 
     def run(self) -> None:
         """Works until an exception such as KeyboardInterrupt."""
@@ -82,12 +86,25 @@ class Worker:
         """Does one job, or several of one pattern together; returns False if there is none."""
         if not self._pending:
             return False
-        jobs = self._next()
-        if len(jobs) == 1 or not self._do_together(jobs):
-            for job in jobs:
-                self._do(job)
+        try:
+            self._work()
+        finally:
+            self._send_answers()
         self._done()
         return True
+
+    def _work(self) -> None:
+        """Does jobs of one message for a while: their answers leave together. A job that came alone is done alone."""
+        end = time.perf_counter() + ANSWER_SECONDS
+        while True:
+            jobs = self._next()
+            if len(jobs) == 1 or not self._do_together(jobs):
+                for job in jobs:
+                    self._do(job)
+            following = next(iter(self._pending.values()), None)
+            together = following is not None and following.batch is not None and following.batch is jobs[-1].batch
+            if not together or time.perf_counter() > end:
+                return
 
     def _next(self) -> list[Job]:
         """Takes the job that waits longest, and others that can be factorized together with it."""
@@ -155,7 +172,9 @@ class Worker:
                 elif isinstance(item, ServersThere):
                     self._choose_server(item.incarnations)
                 else:
-                    self._enqueue(accept(item, self._connection.name, self._connection.incarnation))
+                    connection = self._connection
+                    for job in accept(item, connection.server, connection.name, connection.incarnation):
+                        self._enqueue(job)
             except Refused as refusal:
                 self._counters.refuse(refusal)
         self._done()
@@ -182,6 +201,7 @@ class Worker:
         self._pending.clear()
         self._analyses.clear()
         self._assemblers.clear()
+        self._connection.offered.clear()
 
     def _enqueue(self, job: Job) -> None:
         waiting = self._pending.get(job.object)
@@ -192,9 +212,10 @@ class Worker:
         self._pending[job.object] = job
 
     def _count(self, job: Job) -> None:
+        self._connection.offered.withdraw(job.object)  # the server has the last one, or has given it up
         self._counters.add("jobs")
         self._counters.add("bulk_shared" if job.shared else "bulk_copied")
-        if job.message.HasField("matrix_slot") and not job.shared:
+        if (job.batch is not None or job.message.HasField("matrix_slot")) and not job.shared:
             self._counters.warn("copied", "a matrix came as a copy although shared memory was tried and found to work")
 
     def _do(self, job: Job) -> None:
@@ -281,6 +302,8 @@ class Worker:
         remedy: str = "",
     ) -> None:
         message, connection = job.message, self._connection
+        if job.batch is not None and self._answer_together(job, job.batch, pattern, values, seconds, failure, remedy):
+            return
         answer = Factor(
             header=connection.header(job.object, message.header.epoch, "factor"),
             step=message.step,
@@ -295,10 +318,42 @@ class Worker:
         )
         payload = b""
         if pattern is not None and values is not None:
-            answer.pattern, answer.nonzeros, answer.checksum = pattern.id, pattern.nonzeros, checksum(values)
-            if not self._into_slot(message, answer, values):
-                payload = values.tobytes()
+            answer.pattern, answer.nonzeros = pattern.id, pattern.nonzeros
+            in_slot = self._into_slot(message, answer, values)
+            if not in_slot and 0 < WHOLE_PARTS * message.part_bytes < values.nbytes:
+                number, size = message.header.sequence, message.part_bytes
+                answer.parts.extend(connection.offered.offer(job.object, answer.header, number, values, size))
+            else:
+                answer.checksum = checksum(values)
+                payload = b"" if in_slot else values.tobytes()
         connection.send_factor(answer, payload)
+        if values is not None:
+            self._counters.add("factors")
+
+    def _answer_together(
+        self, job: Job, batch: Batch, pattern: FactorPattern | None, values: NDArray[Any] | None, seconds: float,
+        failure: str, remedy: str,
+    ) -> bool:  # fmt: skip
+        """Adds an answer to those that leave together; False if the factor does not fit into its room."""
+        answer = self._answers.get(id(batch))
+        if answer is None:
+            connection = self._connection
+            answer = BatchAnswer(batch, connection.header("", 0, "factors"), connection.name)
+            self._answers[id(batch)] = answer
+        if pattern is None or values is None:
+            answer.add_failure(job.place, failure[:500])
+            return True
+        return answer.add(job.place, self._connection.slots, pattern, values, seconds, remedy)
+
+    def _send_answers(self) -> None:
+        answers, self._answers = self._answers, {}
+        for answer in answers.values():
+            if not answer.message.jobs:
+                continue
+            try:
+                self._connection.send_factors(answer.finished())
+            except zenoh.ZError as error:
+                self._counters.trouble("unsent", f"factors were not sent: {error}")
 
     def _into_slot(self, message: Any, answer: Factor, values: NDArray[Any]) -> bool:
         """Writes the values into the slot lent for them; returns False if there is none that is large enough."""

@@ -12,9 +12,13 @@ ROOT = "warpfactor"
 SERVER_NAME = "sim"
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"  # loopback: a server listens on other interfaces only when asked
 
-MOST_JOBS = 64  # in flight at one worker, of small objects
+MOST_JOBS = 256  # in flight at one worker, of small objects
 
 KIB, MIB, GIB = 1 << 10, 1 << 20, 1 << 30
+
+PART_BYTES = 4 * MIB  # of a part of a factor: smaller ones cost more time for each byte, larger ones hold others up
+WHOLE_PARTS = 4  # a factor of at most so many parts travels whole
+WHOLE_BYTES = WHOLE_PARTS * PART_BYTES
 
 
 @dataclass(frozen=True)
@@ -41,10 +45,21 @@ CHANNELS: dict[str, Channel] = {
         "checkpoint", "Checkpoint", "server", "queryable", 256 * MIB, 0, "the state that was saved last"
     ),
     "matrix": Channel("matrix/{worker}/{object}", "Matrix", "server", "one in flight per object", 64 * KIB, GIB, "job"),
+    "matrices": Channel(
+        "matrices/{worker}", "MatrixBatch", "server", "as workers take them", 64 * KIB, GIB, "jobs of small objects"
+    ),
     "pattern": Channel(
         "pattern/{worker}/{object}", "FactorPattern", "worker", "when it is new", 256 * MIB, 0, "pattern of L"
     ),
-    "factor": Channel("factor/{worker}/{object}", "Factor", "worker", "one per matrix", 64 * KIB, GIB, "values of L"),
+    "factor": Channel(
+        "factor/{worker}/{object}", "Factor", "worker", "one per matrix", 64 * KIB, WHOLE_BYTES, "values of L"
+    ),
+    "factors": Channel(
+        "factors/{worker}", "FactorBatch", "worker", "one or several for each MatrixBatch", 512 * KIB, 0, "values of L"
+    ),
+    "part": Channel(
+        "part/{worker}", "FactorPart", "worker", "query, of large factors", 4 * KIB, PART_BYTES, "part of values of L"
+    ),
     "worker": Channel("worker/{worker}", "WorkerInfo", "worker", "5 Hz", 16 * KIB, 0, "hello, then heartbeat"),
     "need": Channel("need", "Need", "server", "2 Hz", KIB, 0, "what more workers are worth to it"),
     "echo": Channel("echo/{worker}", "Echo", "worker", "query, at join", 4 * KIB, 0, "does shared memory work?"),

@@ -13,6 +13,7 @@ import zenoh
 
 from precond_worker.errors import NameTaken
 from precond_worker.network.heartbeat import Heartbeat
+from precond_worker.network.offered_factors import OfferedFactors
 from precond_worker.network.presence import Presence, ServerGone, ServersThere
 from precond_worker.network.receive_queue import ReceiveQueue
 from precond_worker.network.retry import Retry
@@ -20,7 +21,7 @@ from precond_worker.remote_assembly import can_assemble
 from protocol.channels import CHANNELS, MOST_JOBS, PROTOCOL, check_name, key
 from protocol.counters import Counters
 from protocol.factor import FactorPattern
-from protocol.messages_pb2 import Factor, Header, Scene, Topology, WorkerInfo
+from protocol.messages_pb2 import Factor, FactorBatch, Header, Scene, Topology, WorkerInfo
 from protocol.network.session import LINK_LEASE, Session
 from protocol.refused import Refused
 from protocol.shared_memory import probe as shm_probe
@@ -59,7 +60,9 @@ class ServerConnection:
         own = key("alive_worker", server, worker=name)
         self._claim(zs, own)
         # Subscribed first, announced last: the server sends as soon as it knows the token.
+        self.offered = OfferedFactors(session, server, name, counters)
         self._matrices = zs.declare_subscriber(key("matrix", server, worker=name), self.received.put)
+        self._batches = zs.declare_subscriber(key("matrices", server, worker=name), self.received.put)
         self._token = zs.liveliness().declare_token(own)
         self._retry = Retry()
         self._conflict_end = float("inf")  # [s, monotonic]; after that time it gives way to no other worker
@@ -77,7 +80,8 @@ class ServerConnection:
             time.sleep(0.1)
 
     def _taken(self, who: str) -> NameTaken:
-        return NameTaken(f"{who} of server {self.server} is called {self.name}; --name gives this one its own")
+        text = f"{who} of server {self.server} is called {self.name}; --name gives this one its own"
+        return NameTaken(text, self.server)
 
     def _heard(self, sample: zenoh.Sample) -> None:
         """Handles a hello under this name, which may be of another worker; the larger process id gives way."""
@@ -115,6 +119,7 @@ class ServerConnection:
     def _beat(self) -> None:
         self._presence.look()
         self._say()
+        self.offered.expire()
 
     def _shared_memory_works(self, incarnation: int) -> bool:
         slots = SlotMap()
@@ -149,6 +154,7 @@ class ServerConnection:
                 share=self.share,
                 leaving=self.leaving is not None,
                 most_jobs=MOST_JOBS,
+                batches=True,
             )
             self._session.zenoh.put(key("worker", self.server, worker=self.name), info.SerializeToString())
 
@@ -194,6 +200,11 @@ class ServerConnection:
         name = key("factor", self.server, worker=self.name, object=message.header.object)
         self._session.zenoh.put(name, values, attachment=message.SerializeToString(), congestion_control=BLOCK)
 
+    def send_factors(self, message: FactorBatch) -> None:
+        """Sends answers to jobs of one batch; the values of the factors are in its slot."""
+        name = key("factors", self.server, worker=self.name)
+        self._session.zenoh.put(name, b"", attachment=message.SerializeToString(), congestion_control=BLOCK)
+
     def leave(self) -> None:
         """Has the server send no more jobs; one under way may still be answered."""
         if self.leaving is None:
@@ -209,7 +220,9 @@ class ServerConnection:
         """Closes, and takes back what it has declared, where the session goes on without it."""
         self.close()
         self._presence.end()
-        for declared in (self._token, self._matrices, self._others):
+        with contextlib.suppress(zenoh.ZError):
+            self.offered.close()
+        for declared in (self._token, self._matrices, self._batches, self._others):
             with contextlib.suppress(zenoh.ZError):
                 declared.undeclare()
 

@@ -62,8 +62,12 @@ class Slot:
 
     def array(self, dtype: DTypeLike, count: int) -> NDArray[Any]:
         """Returns the first `count` values of the slot, in place."""
+        return self.part(0, dtype, count)
+
+    def part(self, first: int, dtype: DTypeLike, count: int) -> NDArray[Any]:
+        """Returns `count` values from the byte `first` on, in place."""
         kind = np.dtype(dtype)
-        return self._bytes[HEADER : HEADER + count * kind.itemsize].view(kind)
+        return self._bytes[HEADER + first : HEADER + first + count * kind.itemsize].view(kind)
 
     def message(self) -> SlotMessage:
         """Describes the slot for a borrower on this host."""
@@ -163,6 +167,11 @@ class SlotPool:
             self._returns += 1
             slot.returned = self._returns
             self._free.setdefault(slot.capacity, deque()).append(slot)
+
+    def discard(self, slot: Slot) -> None:
+        """Takes back a slot that its borrower may still write to: it is not lent again, its memory is freed."""
+        if self._lent.pop(id(slot), None) is not None:
+            self._live.discard(slot)
 
     def _make(self, capacity: int) -> Slot | None:
         while not self._fits(capacity) and (unused := [slots for slots in self._free.values() if slots]):

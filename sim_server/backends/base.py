@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from protocol.factor import FactorPattern
+from protocol.factor import Factor, FactorPattern
 from sim_server.arrays import Float64, Int32
 from sim_server.backends.state import StateArray
 
@@ -125,11 +125,13 @@ class LoopState(Protocol):
     """Memory that a running loop shares with other threads.
 
     step: number of completed steps. start_time: of the simulation at step 0 [s]
-    realtime, patient, stop, pause: 0 or 1, set by others
+    realtime, patient, stop: 0 or 1, set by others
+    pause: number of a pause, 0: none, set by others; halted: the pause in which the loop stands still, 0: it does not
     single: steps that it is to make while it is paused
     hold: number of a request to stand still between two steps, 0: none; held: the last one that it has followed
     frame_every, energy_every: steps between those that are reported, 0: none
-    deadline: 0 while the loop stands still in a pause [s]
+    deadline: of the next step, 0: at once [s]
+    record_capacity: records that find room
     late_steps, frames_dropped, records_dropped, others_dropped (reactions on what is no obstacle): numbers so far
     """
 
@@ -139,12 +141,14 @@ class LoopState(Protocol):
     patient: int
     stop: int
     pause: int
+    halted: int
     single: int
     hold: int
     held: int
     deadline: float
     frame_every: int
     energy_every: int
+    record_capacity: int
     late_steps: int
     frames_dropped: int
     records_dropped: int
@@ -240,6 +244,9 @@ class Engine(Protocol):
         """Takes a factor of the matrix of `step`, whose values do not change any more; one of the next solves of the
         body takes it up."""
         ...
+
+    def post_factors(self, bodies: Sequence[int], factors: Sequence[Factor]) -> None:
+        """Posts factors of different bodies, one of each."""
 
     def prepare_for_factors(self) -> None:
         """Begins what the first factor would wait for, without waiting."""

@@ -4,22 +4,26 @@
 import logging
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 import zenoh
 
-from protocol.channels import CHANNELS, MOST_JOBS, key, name_in
+from protocol.channels import CHANNELS, MOST_JOBS, PART_BYTES, WHOLE_PARTS, key, name_in
 from protocol.counters import Counters
 from protocol.factor import Factor, FactorPattern
 from protocol.messages_pb2 import Factor as FactorMessage
 from protocol.messages_pb2 import Topology, WorkerInfo
+from protocol.method import Method
 from protocol.refused import Refused
 from protocol.shared_memory.pool import Slot, SlotPool
 from protocol.validate import take
-from sim_server.network.factor_decoder import FactorDecoder
+from sim_server.network.batch_message import MOST_TOGETHER, Entry, batch_message, entries_of, group
+from sim_server.network.factor_decoder import AnnouncedObject, FactorDecoder
+from sim_server.network.factor_fetch import AHEAD, FactorFetch
 from sim_server.network.inbox import Inbox
 from sim_server.network.job_message import add_values, matrix_message
 from sim_server.network.leases import MAX_EXPIRED, InFlightJob, Leases
@@ -39,7 +43,18 @@ QUEUE_SECONDS = 0.02  # s of factorizations that wait at a worker at most
 LOOK_PERIOD = 1e-3  # s between looks at which leases are over
 MAX_SENT = 4096  # times of jobs that are remembered
 LARGE = 4 << 20  # bytes of a factor whose copy and checks take more than a few milliseconds
+SLOT_SHARE = 4  # a larger part of all shared memory than a SLOT_SHARE-th is not lent for one factor: it goes in parts
+FETCHES = 2  # factors that arrive in parts at a time, each in memory of its own
 SLOT_MARGIN = 8  # the slot for an incomplete factor is larger than the largest factor so far by a SLOT_MARGIN-th
+
+
+class AnsweredJob(NamedTuple):
+    """A job whose factor is taken in beside the caller. fetch: of its parts, if it comes in parts."""
+
+    message: FactorMessage
+    job: InFlightJob
+    factor: Future[Factor]
+    fetch: FactorFetch | None = None
 
 
 class Dispatch(FactorSource):
@@ -76,7 +91,8 @@ class Dispatch(FactorSource):
         self._answered_at: dict[str, float] = {}  # likewise, of the answers with a factor
         self._fast_links: set[str] = set()  # workers without shared memory whose link takes a job at once
         self._thread = ThreadPoolExecutor(1, "large factors")
-        self._decoding: list[tuple[FactorMessage, InFlightJob, Future[Factor]]] = []
+        self._fetching = ThreadPoolExecutor(FETCHES, "parts of factors")
+        self._decoding: list[AnsweredJob] = []
         self._factors: list[Factor] = []
         self._failures: list[tuple[str, str]] = []
         self._patterns: list[tuple[str, FactorPattern]] = []
@@ -87,6 +103,7 @@ class Dispatch(FactorSource):
             "worker": self._on_heartbeat,
             "pattern": self._on_pattern,
             "factor": self._on_factor,
+            "factors": self._on_factors,
             "alive_worker": self._on_token,
         }
 
@@ -158,13 +175,16 @@ class Dispatch(FactorSource):
         with self._lock:
             now = self._clock()
             idle = [(name, now - self._free_since.get(name, 0.0)) for name in self._open()]
-            busy = [(j.worker, j.object, now - j.sent_at) for j in self.leases.jobs if not self._room(j.worker)]
+            full = {name for name in self.leases.by_worker if not self._room(name)}
+            busy = [(j.worker, j.object, now - j.sent_at) for j in self.leases.jobs if j.worker in full]
             return self._timing.faster_busy_workers(idle, busy)
 
     def reassigned(self) -> list[str]:
         """Objects whose job was taken from a slow worker since another one is idle; they may be submitted again."""
         with self._lock:
-            slow = self.leases.reassign(self._clock(), self._has_candidates)
+            slow = self.leases.reassign(
+                self._clock(), lambda job: not self._is_decoded(job) and self._has_candidates(job)
+            )
             self._counters.add("passed_on", len(slow))
             return [job.object for job in slow]
 
@@ -199,23 +219,142 @@ class Dispatch(FactorSource):
     def submit(self, job: Job) -> bool:
         """Sends a job to a worker with room; False if there is none or the object has a job in flight."""
         with self._lock:
+            self._receive()
             return self._submit(job)
 
-    def _submit(self, job: Job) -> bool:
+    def submit_many(self, jobs: Sequence[Job]) -> list[bool]:
+        """Sends jobs of different objects, the most urgent first, those of small objects to one worker in one message.
+
+        False for those for which no worker has room, or whose object has a job in flight.
+        """
+        with self._lock:
+            self._receive()
+            return self._submit_many(jobs)
+
+    def _submit_many(self, jobs: Sequence[Job]) -> list[bool]:
+        taken = [False] * len(jobs)
+        batches: dict[tuple[str, tuple[str, Method]], list[int]] = {}  # places of jobs by worker and what they share
+        rooms = {name: self._room(name) for name in self._open()} if len(jobs) > 1 else {}
+        for place, job in enumerate(jobs):
+            idle = [name for name, room in rooms.items() if room > 0]
+            worker = self._worker_for(job, idle, rooms) if idle else None
+            if worker is None or not self._may_batch(job, worker):
+                taken[place] = self._submit(job)
+                rooms = {name: self._room(name) for name in self._open()}
+                for (name, _), places in batches.items():
+                    rooms[name] = rooms.get(name, 0) - len(places)
+            else:
+                rooms[worker] -= 1
+                batches.setdefault((worker, group(job)), []).append(place)
+        for (worker, _), places in batches.items():
+            for k in range(0, len(places), MOST_TOGETHER):
+                part = places[k : k + MOST_TOGETHER]
+                for place, sent in zip(part, self._send_batch(worker, [jobs[p] for p in part]), strict=True):
+                    taken[place] = sent
+        return taken
+
+    def _worker_for(self, job: Job, idle: list[str], rooms: Mapping[str, int]) -> str | None:
+        """Chooses a worker of those with room; None if there is none or the object has a job in flight."""
+        self._check_job(job)
+        if job.object in self.leases.by_object:
+            return None
+        able = [name for name in idle if not job.positions or self._assembles(name)]
+        if self._reliability.failing_objects:
+            able = self._candidates(able, self._available(), job.object)
+        return self._choose(able, job.object, rooms) if able else None
+
+    def _may_batch(self, job: Job, worker: str) -> bool:
+        """True if a job of the worker may share a message with others: its object is small, and the size of its factor
+        is known."""
+        info = self._registry.info(worker)
+        return (
+            not job.positions
+            and job.method.name in self.decoder.objects[job.object].largest
+            and job.method.name != "incomplete_cholesky"  # the next factor may be larger
+            and info is not None
+            and info.batches
+            and self._room(worker) > 1
+            and self._has_slots(worker)
+        )
+
+    def _send_batch(self, worker: str, jobs: Sequence[Job]) -> list[bool]:
+        """Sends jobs to a worker in one message, or one by one if there are no slots for them together."""
+        slots = None
+        if len(jobs) > 1:
+            entries = entries_of([(job, self.decoder.objects[job.object]) for job in jobs])
+            slots = self._allocate_batch(entries)
+        if slots is None:
+            return [self._submit_to(worker, job) for job in jobs]
+        leases = [self.leases.lease(job.object, worker, job.method.name) for job in jobs]
+        in_flight = [
+            self._begin_job(job, worker, lease, slots, factor_slot=slots[1], first=entry.first, room=entry.room)
+            for job, lease, entry in zip(jobs, leases, entries, strict=True)
+        ]
+        message = batch_message(entries, in_flight, leases, self._incarnation, *slots)
+        name, attachment = key("matrices", self._server, worker=worker), message.SerializeToString()
+        payload = slots[0].payload
+        if self._queue.post(lambda: self._send(in_flight, name, payload, attachment, True)):
+            self._on_sent(worker, jobs)
+            return [True] * len(jobs)
+        for job in in_flight:
+            self.leases.cancel(job)
+        return [False] * len(jobs)
+
+    def _allocate_batch(self, entries: Sequence[Entry]) -> tuple[Slot, Slot] | None:
+        """Allocates a slot for matrices and one for factors; None if there is not enough shared memory."""
+        assert self._pool is not None
+        matrices = self._pool.lend(sum(entry.job.values.nbytes for entry in entries), len(entries))
+        factors = self._pool.lend(entries[-1].first + entries[-1].room, len(entries))
+        if matrices is not None and factors is not None:
+            return matrices, factors
+        for slot in filter(None, (matrices, factors)):
+            for _ in entries:
+                self._pool.give_back(slot)
+        return None
+
+    def _on_sent(self, worker: str, jobs: Sequence[Job]) -> None:
+        for job in jobs:
+            self._last_worker[job.object] = worker
+        self._reliability.on_sent(worker, self._clock())
+        self._counters.add("jobs", len(jobs))
+        self._counters.add("bytes_out", sum(job.values.nbytes for job in jobs))
+
+    def _check_job(self, job: Job) -> AnnouncedObject:
         known = self.decoder.objects.get(job.object)
         if known is None or known.epoch != job.epoch:
             raise ValueError(f"job for {job.object} epoch {job.epoch}, which was not announced")
         shape = (known.size // 3, 3) if job.positions else (known.blocks, 3, 3)
         if job.values.shape != shape or job.values.dtype != np.float64:
             raise ValueError(f"job for {job.object}: values {job.values.shape}, allowed: float64 {shape}")
-        self._receive()
+        return known
+
+    def _submit(self, job: Job) -> bool:
+        self._check_job(job)
         idle = [name for name in self._open() if not job.positions or self._assembles(name)]
         idle = self._candidates(idle, self._available(), job.object)
         if job.object in self.leases.by_object or not idle:
             return False
-        worker = self._choose(idle, job.object)
+        return self._submit_to(self._choose(idle, job.object), job)
+
+    def _submit_to(self, worker: str, job: Job) -> bool:
+        """Sends a job alone."""
         matrix_slot, factor_slot = self._allocate_slots(worker, job)
-        lease = self.leases.lease(job.object, worker, job.method.name, job.positions)
+        lease = self.leases.lease(
+            job.object, worker, job.method.name, job.positions, self.decoder.objects[job.object].blocks
+        )
+        slots = tuple(slot for slot in (matrix_slot, factor_slot) if slot is not None)
+        payload_bytes = 0 if matrix_slot else job.values.nbytes
+        in_flight = self._begin_job(job, worker, lease, slots, factor_slot=factor_slot, payload_bytes=payload_bytes)
+        if self._post(in_flight, job, lease, matrix_slot):
+            self._on_sent(worker, [job])
+            return True
+        self.leases.cancel(in_flight)
+        return False
+
+    def _begin_job(
+        self, job: Job, worker: str, lease: float, slots: tuple[Slot, ...], factor_slot: Slot | None, **more: int
+    ) -> InFlightJob:
+        """Begins the lease of a job that is being sent. more: fields of InFlightJob"""
         now = self._clock()
         in_flight = InFlightJob(
             self.leases.next_number(),
@@ -228,22 +367,16 @@ class Dispatch(FactorSource):
             deadline=now + lease,
             factor_slot=factor_slot,
             factor_generation=factor_slot.generation if factor_slot else 0,
-            slots=tuple(slot for slot in (matrix_slot, factor_slot) if slot is not None),
+            slots=slots,
             sent_at=now,
-            exclusive_until=now + self.leases.exclusive_period(job.object, known.blocks),
+            exclusive_until=now + self.leases.exclusive_period(job.object, self.decoder.objects[job.object].blocks),
             method=job.method.name,
-            payload_bytes=0 if matrix_slot else job.values.nbytes,
             positions=job.positions,
+            part_bytes=PART_BYTES,
+            **more,
         )
         self.leases.start(in_flight)
-        if self._post(in_flight, job, lease, matrix_slot):
-            self._last_worker[job.object] = worker
-            self._reliability.on_sent(worker, now)
-            self._counters.add("jobs")
-            self._counters.add("bytes_out", job.values.nbytes)
-            return True
-        self.leases.cancel(in_flight)
-        return False
+        return in_flight
 
     def _available(self) -> list[str]:
         return self._registry.available(self._clock(), self.leases.deadlines())
@@ -265,7 +398,12 @@ class Dispatch(FactorSource):
         small = self.decoder.most_blocks <= SMALL_BLOCKS and self._pool is not None
         if info is not None and info.shared_memory and seconds is not None and small:
             most = max(1, min(info.most_jobs, MOST_JOBS, int(QUEUE_SECONDS / max(seconds, 1e-6))))
-        return max(0, most - self.leases.count(worker))
+        return max(0, most - self._waiting(worker))
+
+    def _waiting(self, worker: str) -> int:
+        """Number of jobs that a worker has not done yet; those whose parts are fetched are done."""
+        fetched = sum(each.job.worker == worker for each in self._decoding if each.fetch is not None)
+        return self.leases.count(worker) - fetched
 
     def _candidates(self, idle: list[str], available: list[str], object: str) -> list[str]:
         """Idle workers that are not suspended for the object; all idle ones if all available workers are."""
@@ -282,12 +420,18 @@ class Dispatch(FactorSource):
         info = self._registry.info(worker)
         return info is not None and info.builds
 
-    def _choose(self, idle: list[str], object: str) -> str:
+    def _choose(self, idle: list[str], object: str, rooms: Mapping[str, int] | None = None) -> str:
         """Chooses the worker with the fewest expired jobs; then the one that would be done first, the one with the
-        fewest jobs in flight, the last of the object, the least used."""
+        fewest jobs in flight, the last of the object, the least used.
+
+        rooms: jobs that workers can take besides those that are about to be sent; None: none is
+        """
+        if len(idle) == 1:
+            return idle[0]
 
         def rank(name: str) -> tuple[int, float, int, bool, int]:
-            info, waiting = self._registry.info(name), self.leases.count(name)
+            info, waiting = self._registry.info(name), self._waiting(name)
+            waiting += 0 if rooms is None else self._room(name) - rooms[name]
             expired, expected = self.leases.expired_count(name), self._timing.expected(name, object)
             other = self._last_worker.get(object) != name
             return expired, (1 + waiting) * expected, waiting, other, info.jobs if info else 0
@@ -296,18 +440,25 @@ class Dispatch(FactorSource):
 
     def _allocate_slots(self, worker: str, job: Job) -> tuple[Slot | None, Slot | None]:
         """Allocates slots for the matrix and its factor; None for an array that must travel as bytes."""
-        info = self._registry.info(worker)
-        unfit = info is None or not info.shared_memory or self.leases.expired_count(worker) >= MAX_EXPIRED
-        if self._pool is None or unfit:
+        if self._pool is None or not self._has_slots(worker):
             return None, None
         nonzeros = self.decoder.objects[job.object].largest.get(job.method.name, 0)
         if job.method.name == "incomplete_cholesky":
             nonzeros += nonzeros // SLOT_MARGIN  # the next factor may keep more blocks
+        size = nonzeros * np.dtype(job.dtype).itemsize
+        if size > max(WHOLE_PARTS * PART_BYTES, self._pool.limit // SLOT_SHARE):
+            size = 0  # it comes in parts
         matrix = self._pool.lend(job.values.nbytes)
-        factor = self._pool.lend(nonzeros * np.dtype(job.dtype).itemsize) if nonzeros else None
-        if matrix is None or (nonzeros and factor is None):
+        factor = self._pool.lend(size) if size else None
+        if matrix is None or (size and factor is None):
             self._counters.trouble("slots_exhausted", "no slot of shared memory is left, an array travels as bytes")
         return matrix, factor
+
+    def _has_slots(self, worker: str) -> bool:
+        """True if arrays may travel to and from a worker in slots of shared memory."""
+        info = self._registry.info(worker)
+        unfit = info is None or not info.shared_memory or self.leases.expired_count(worker) >= MAX_EXPIRED
+        return self._pool is not None and not unfit
 
     def _post(self, in_flight: InFlightJob, job: Job, lease: float, slot: Slot | None) -> bool:
         known = self.decoder.objects[job.object]
@@ -315,25 +466,29 @@ class Dispatch(FactorSource):
         payload = add_values(message, job.values, slot)
         name = key("matrix", self._server, worker=in_flight.worker, object=in_flight.object)
         attachment = message.SerializeToString()
-        return self._queue.post(lambda: self._send(in_flight, name, payload, attachment, slot is not None))
+        return self._queue.post(lambda: self._send([in_flight], name, payload, attachment, slot is not None))
 
-    def _send(self, job: InFlightJob, name: str, payload: zenoh.ZBytes, attachment: bytes, shared: bool) -> None:
-        """Sends a job, in the thread of the send queue. If a link is full, zenoh drops the job or blocks.
+    def _send(
+        self, jobs: Sequence[InFlightJob], name: str, payload: zenoh.ZBytes, attachment: bytes, shared: bool
+    ) -> None:  # fmt: skip
+        """Sends a job or a batch of them, in the thread of the send queue. If a link is full, zenoh drops it or blocks.
 
         A dropped job ends its lease. zenoh blocks only for bytes over a link that is not known to be fast, since a
         slow link takes longer than zenoh would keep them. While it blocks for one receiver all others wait too, even
         for a receiver that subscribed to everything and stopped reading. The priority is one of its own, since a
         blocked message locks the queue of its priority.
         """
-        drop = shared or job.worker in self._fast_links
+        worker = jobs[0].worker
+        drop = shared or worker in self._fast_links
         control = zenoh.CongestionControl.DROP if drop else zenoh.CongestionControl.BLOCK
         begin = time.perf_counter()
         self._session.put(
             name, payload, attachment=attachment, congestion_control=control, priority=zenoh.Priority.BACKGROUND
         )
         if not drop and time.perf_counter() - begin < FAST_SEND:
-            self._fast_links.add(job.worker)
-        self._sent[job.number] = self._clock()
+            self._fast_links.add(worker)
+        for job in jobs:
+            self._sent[job.number] = self._clock()
 
     # ---- messages from workers -------------------------------------------------------------------------------
 
@@ -353,7 +508,7 @@ class Dispatch(FactorSource):
         if len(self._sent) > MAX_SENT:
             flying = {job.number for job in self.leases.jobs}
             self._sent = {number: when for number, when in self._sent.items() if number in flying}
-        for job in self.leases.expire(now):
+        for job in self.leases.expire(now, self._is_decoded):
             self._counters.add("leases_over")
             self._on_expired(job, "was not answered within its lease")
         for job in self.leases.expire_undelivered(self._sent_at, self._registry.idle_period):
@@ -417,44 +572,119 @@ class Dispatch(FactorSource):
         self._reliability.on_answer(job.worker)
         if self.leases.is_reassigned(job):
             return self.leases.finish(job, None if message.failure else message.seconds)
+        if message.parts and not message.failure:
+            return self._fetch(message, job)
         decode = partial(self.decoder.decode, message, sample.payload, job)
         if not message.failure and 4 * message.nonzeros > LARGE:  # its bytes are copied and checked beside the caller
-            if self._is_decoded(job):
-                raise Refused(f"Factor.job is {job.number}, already answered", "duplicate")
-            self._decoding.append((message, job, self._thread.submit(decode)))
+            self._refuse_second(job)
+            self._decoding.append(AnsweredJob(message, job, self._thread.submit(decode)))
             return
-        self._take_factor(message, job, decode)
+        self._take_factor(job, decode, message.failure, message.seconds, _slots_used(message))
+
+    def _on_factors(self, sample: zenoh.Sample) -> None:
+        """Takes answers to jobs of a batch, each by itself: what is wrong with one costs the others nothing."""
+        message = self.decoder.parse_batch(sample.key_expr, sample.attachment)
+        now, worker = self._clock(), message.worker
+        self._registry.mark_seen(worker, now)
+        duration: float | None = None
+        for place, number in enumerate(message.jobs):
+            try:
+                job = self.leases.match_answer(number, worker, None)
+                failure = message.failures[place] if message.failures else ""
+                if duration is None:
+                    duration = self._duration(job, now) / len(message.jobs)
+                    self._free_since[worker] = now
+                    self._reliability.on_answer(worker)
+                if self.leases.is_reassigned(job):
+                    self.leases.finish(job, None if failure else message.seconds[place])
+                    continue
+                decode = partial(self.decoder.decode_one, message, place, job)
+                by_slot = message.matrix_shared, True
+                self._take_factor(job, decode, failure, message.seconds[place], by_slot, duration)
+            except Refused as refusal:
+                self._counters.refuse(refusal)
+
+    def _fetch(self, message: FactorMessage, job: InFlightJob) -> None:
+        """Begins to fetch a factor in parts, beside the caller. Its worker is free for the jobs of other objects."""
+        self._refuse_second(job)
+        info, slots = self._registry.info(job.worker), []
+        if self._pool is not None and info is not None and info.shared_memory:
+            slots = [slot for slot in (self._pool.lend(job.part_bytes) for _ in range(AHEAD)) if slot is not None]
+            if len(slots) < AHEAD:
+                self._give_back(slots)
+                slots = []
+        fetch = FactorFetch(
+            self._session, self._server, self._incarnation, self._counters, job, message.nonzeros, message.parts, slots
+        )
+        decode = partial(self.decoder.decode, message, b"", job, fetch.run)
+        self._decoding.append(AnsweredJob(message, job, self._fetching.submit(decode), fetch))
+
+    def _give_back(self, slots: Sequence[Slot], clean: bool = True) -> None:
+        """Frees the slots of a fetch. clean: nobody writes to them any more."""
+        if self._pool is not None:
+            for slot in slots:
+                (self._pool.give_back if clean else self._pool.discard)(slot)
+
+    def _refuse_second(self, job: InFlightJob) -> None:
+        if self._is_decoded(job):
+            raise Refused(f"Factor.job is {job.number}, already answered", "duplicate")
 
     def _is_decoded(self, job: InFlightJob) -> bool:
-        """True while the answer to a job is decoded beside the caller."""
-        return any(other.number == job.number for _, other, _ in self._decoding)
+        """True while the answer to a job is taken in beside the caller."""
+        return any(each.job.number == job.number for each in self._decoding)
 
     def _take_decoded(self) -> None:
         """Takes the large factors that were decoded beside the caller, unless their jobs are over."""
-        done = [each for each in self._decoding if each[2].done()]
+        for each in self._decoding:
+            if each.fetch is not None and self.leases.by_object.get(each.job.object) is not each.job:
+                each.fetch.gone.set()
+        done = [each for each in self._decoding if each.factor.done()]
         for each in done:
             self._decoding.remove(each)
-            message, job, factor = each
+            message, job, factor, fetch = each
+            if fetch is not None:
+                self._give_back(fetch.slots, fetch.clean)
+                if fetch.gone.is_set():  # why its job is over was told
+                    self._end_gone(job)
+                    continue
             try:
                 current = self.leases.match_answer(job.number, job.worker, job.epoch)
                 if self.leases.is_reassigned(current):
                     self.leases.finish(current, message.seconds)
                 else:
-                    self._take_factor(message, current, factor.result)
+                    by_slot = (
+                        message.matrix_shared,
+                        bool(fetch.slots if fetch is not None else message.HasField("slot")),
+                    )
+                    self._take_factor(current, factor.result, message.failure, message.seconds, by_slot)
             except Refused as refusal:
                 self._counters.refuse(refusal)
 
-    def _take_factor(self, message: FactorMessage, job: InFlightJob, decode: Callable[[], Factor]) -> None:
-        """Takes the answer to a job: the factor that `decode` returns, or a failure."""
+    def _end_gone(self, job: InFlightJob) -> None:
+        """Frees the worker of a job that is over, if it is still there."""
+        if self.leases.by_worker.get(job.worker, {}).get(job.number) is job:
+            self.leases.finish(job)
+
+    def _take_factor(
+        self, job: InFlightJob, decode: Callable[[], Factor], failure: str, told: float, by_slot: tuple[bool, bool],
+        duration: float | None = None,
+    ) -> None:  # fmt: skip
+        """Takes the answer to a job: the factor that `decode` returns, or a failure.
+
+        told: time [s] of the factorization, by the worker
+        by_slot: matrix and factor travelled in shared memory
+        duration: from matrix to factor [s]; None: until now
+        """
         now, seconds = self._clock(), None
         try:
-            if message.failure:
+            if failure:
                 self._counters.add("failures")
                 self._reliability.on_failure(job.worker, job.object, now)
-                return self._fail(job, f"failed: {message.failure}")
+                return self._fail(job, f"failed: {failure[:500]}")
             self._factors.append(decode())
-            seconds = message.seconds
-            self._timing.record(job.worker, job.object, self._duration(job, now), seconds)
+            seconds = told
+            lasted = self._duration(job, now) if duration is None else duration
+            self._timing.record(job.worker, job.object, lasted, seconds)
         except Refused as refusal:
             self._reliability.on_failure(job.worker, job.object, now)
             self._fail(job, f"was refused: {refusal}")
@@ -465,8 +695,8 @@ class Dispatch(FactorSource):
         self._counters.add("bytes_in", self._factors[-1].values.nbytes)
         capacity = job.factor_slot.capacity if job.factor_slot is not None else 0
         fits = 0 < self._factors[-1].values.nbytes <= capacity  # an incomplete factor may be the largest so far
-        self._count_bulk("matrix", job, message.matrix_shared, bool(job.slots))
-        self._count_bulk("factor", job, message.HasField("slot"), fits)
+        self._count_bulk("matrix", job, by_slot[0], bool(job.slots))
+        self._count_bulk("factor", job, by_slot[1], fits)
 
     def _duration(self, job: InFlightJob, now: float) -> float:
         """Time [s] from matrix to factor, without that for which the job waited behind others of its worker."""
@@ -482,3 +712,8 @@ class Dispatch(FactorSource):
 
     def _fail(self, job: InFlightJob, why: str) -> None:
         self._failures.append((job.object, f"factorization of {job.object} at step {job.step} {why}"))
+
+
+def _slots_used(message: FactorMessage) -> tuple[bool, bool]:
+    """Whether matrix and factor travelled in shared memory."""
+    return message.matrix_shared, message.HasField("slot")

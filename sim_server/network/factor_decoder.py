@@ -1,15 +1,18 @@
 # SPDX-License-Identifier: MIT
 """Checks and decodes what workers send: patterns of L, and factors as bytes or in a slot of shared memory."""
 
+import math
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
 
-from protocol.channels import CHANNELS, name_in
+from protocol.channels import CHANNELS, MOST_JOBS, name_in
 from protocol.factor import Factor, FactorPattern, check_values
 from protocol.messages_pb2 import Factor as FactorMessage
+from protocol.messages_pb2 import FactorBatch, Topology
 from protocol.messages_pb2 import FactorPattern as PatternMessage
-from protocol.messages_pb2 import Topology
+from protocol.messages_pb2 import Slot as SlotMessage
 from protocol.refused import Refused
 from protocol.validate import Sized, array, check_header, check_numbers, check_strings, parse, take
 from sim_server.arrays import Float32, Float64
@@ -85,8 +88,11 @@ class FactorDecoder:
             raise Refused(f"Factor.seconds is {message.seconds}; allowed: 0 or more", "malformed")
         return message
 
-    def decode(self, message: FactorMessage, payload: Sized, job: InFlightJob) -> Factor:
-        """Returns the factor that answers a job."""
+    def decode(
+        self, message: FactorMessage, payload: Sized, job: InFlightJob,
+        fetch: Callable[[], Float32 | Float64] | None = None,
+    ) -> Factor:  # fmt: skip
+        """Returns the factor that answers a job. fetch: returns values that are in parts, each with its checksum."""
         for name, value, wanted in (
             ("header.object", message.header.object, job.object),
             ("step", message.step, job.step),
@@ -100,15 +106,50 @@ class FactorDecoder:
             raise Refused(f"Factor.pattern is {message.pattern:016x}, which was not sent before", "pattern")
         if message.nonzeros != pattern.nonzeros:
             raise Refused(f"Factor.nonzeros is {message.nonzeros}; allowed: {pattern.nonzeros}", "shape")
+        if fetch is not None:
+            return self._factor(pattern, fetch(), None, job, message.seconds, message.remedy)
         in_slot = message.HasField("slot")
-        values = _from_slot(message, job) if in_slot else _from_payload(message, payload)
-        check_values(values, pattern, message.checksum)
+        values = _from_slot(message.slot, message.nonzeros, job) if in_slot else _from_payload(message, payload)
+        return self._factor(pattern, values, message.checksum, job, message.seconds, message.remedy)
+
+    def parse_batch(self, key: object, attachment: Sized | None) -> FactorBatch:
+        """Parses a message with answers to several jobs. Each answer is checked by itself, in `decode_one`."""
+        message = parse(FactorBatch, attachment, CHANNELS["factors"].limit)
+        check_header(message, incarnation=self._incarnation)
+        check_strings(message, 256)
+        if message.worker != name_in("factors", key, "worker"):
+            raise Refused(f"FactorBatch.worker is {message.worker[:80]!r}, its key is {key}", "worker")
+        count = len(message.jobs)
+        lengths = {name: len(getattr(message, name)) for name in ("patterns", "nonzeros", "checksums", "seconds")}
+        texts = {name: len(getattr(message, name)) for name in ("failures", "remedies")}
+        if not 0 < count <= MOST_JOBS or any(n != count for n in lengths.values()):
+            raise Refused(f"FactorBatch.jobs has {count} numbers, other fields {lengths}; allowed: as many", "shape")
+        if any(n not in (0, count) for n in texts.values()):
+            raise Refused(f"FactorBatch.jobs has {count} numbers, texts {texts}; allowed: none or as many", "shape")
+        return message
+
+    def decode_one(self, message: FactorBatch, place: int, job: InFlightJob) -> Factor:
+        """Returns one of the factors of a message, which answers a job."""
+        seconds, nonzeros = message.seconds[place], message.nonzeros[place]
+        if not 0 <= seconds < math.inf:
+            raise Refused(f"FactorBatch.seconds has {seconds}; allowed: finite, 0 or more", "malformed")
+        pattern = self.objects[job.object].patterns.get(message.patterns[place])
+        if pattern is None:
+            raise Refused(f"FactorBatch.patterns has {message.patterns[place]:016x}, which was not sent", "pattern")
+        if nonzeros != pattern.nonzeros:
+            raise Refused(f"FactorBatch.nonzeros has {nonzeros}; allowed: {pattern.nonzeros}", "shape")
+        values = _from_slot(message.slot, nonzeros, job)
+        remedy = message.remedies[place] if message.remedies else ""
+        return self._factor(pattern, values, message.checksums[place], job, seconds, remedy)
+
+    def _factor(
+        self, pattern: FactorPattern, values: Float32 | Float64, checksum: int | None, job: InFlightJob,
+        seconds: float, remedy: str,
+    ) -> Factor:  # fmt: skip
+        check_values(values, pattern, checksum)
         largest = self.objects[job.object].largest
         largest[job.method] = max(largest.get(job.method, 0), pattern.nonzeros)
-        return Factor(
-            job.object, job.epoch, job.step, job.warp, pattern, values, job.worker, message.seconds,
-            message.remedy[:200],
-        )  # fmt: skip
+        return Factor(job.object, job.epoch, job.step, job.warp, pattern, values, job.worker, seconds, remedy[:200])
 
     def _object(self, message: PatternMessage | FactorMessage, key: object, channel: str) -> AnnouncedObject:
         header = check_header(message, incarnation=self._incarnation, object=self.objects)
@@ -117,19 +158,19 @@ class FactorDecoder:
         return self.objects[header.object]
 
 
-def _from_slot(message: FactorMessage, job: InFlightJob) -> Float32 | Float64:
+def _from_slot(told: SlotMessage, nonzeros: int, job: InFlightJob) -> Float32 | Float64:
     """Copies the values out of the slot allocated for the job: they must not change any more once they are checked."""
     slot = job.factor_slot
     if slot is None:
         raise Refused("Factor.slot is set, but no slot was lent for this job", "slot")
-    given = (message.slot.segment, message.slot.offset, message.slot.generation)
+    given = (told.segment, told.offset, told.generation)
     allocated = (slot.segment, slot.offset, job.factor_generation)
     if given != allocated:
         raise Refused(f"Factor.slot is {given}; allowed: {allocated}, as lent for this job", "slot")
-    size = message.nonzeros * np.dtype(job.dtype).itemsize
-    if size > slot.capacity:
-        raise Refused(f"Factor.nonzeros is {message.nonzeros}: {size} bytes in a slot of {slot.capacity}", "slot")
-    return slot.array(job.dtype, message.nonzeros).copy()
+    size, room = nonzeros * np.dtype(job.dtype).itemsize, job.room or slot.capacity
+    if size > room:
+        raise Refused(f"Factor.nonzeros is {nonzeros}: {size} bytes in a slot of {room}", "slot")
+    return slot.part(job.first, job.dtype, nonzeros).copy()
 
 
 def _from_payload(message: FactorMessage, payload: Sized) -> Float32 | Float64:

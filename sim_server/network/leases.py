@@ -13,6 +13,7 @@ from protocol.shared_memory.pool import Slot
 
 MIN_LEASE = 2.0  # s
 MAX_LEASE = 120.0  # s; also for the first job of an object at a worker, which may compile, import and analyse for it
+LEASE_BLOCKS = 500_000  # of a matrix, above which the longest lease grows as the operations of a factor, blocks^2
 MAX_DOUBLINGS = 8  # of a lease
 LEASE_FACTOR = 20  # a lease is this multiple of the duration of the last factorization
 EXCLUSIVE_PER_BLOCK = 1e-4  # s per block of the matrix: exclusive period of an object without any factor yet
@@ -38,8 +39,10 @@ class InFlightJob:
     sent_at, deadline: begin and end of its lease
     exclusive_until: from then on another worker may be asked for the object
     slots: shared memory allocated for the matrix and the factor
+    room: bytes of the factor slot that are for this job, from `first` on
     payload_bytes: size of the values if they are in no slot
     positions: they are positions, from which the worker assembles the matrix
+    part_bytes: of each part of a factor that travels in parts
     """
 
     number: int
@@ -53,11 +56,14 @@ class InFlightJob:
     factor_slot: Slot | None = None
     factor_generation: int = 0
     slots: tuple[Slot, ...] = ()
+    first: int = 0
+    room: int = 0
     sent_at: float = 0.0
     exclusive_until: float = 0.0
     method: str = "cholesky"
     payload_bytes: int = 0
     positions: bool = False
+    part_bytes: int = 0
 
 
 class Leases:
@@ -76,6 +82,7 @@ class Leases:
         self._answered: dict[tuple[str, str], set[tuple[str, bool]]] = {}  # methods, and whether it assembled, likewise
         self._doublings: dict[tuple[str, str], int] = {}  # of the lease, after expired jobs, by object and worker
         self._reassigned: set[int] = set()  # numbers of jobs whose object another worker may have
+        self._deadlines: dict[str, float] | None = None  # None: to be reckoned anew
         self._last = 0
 
     def next_number(self) -> int:
@@ -83,17 +90,20 @@ class Leases:
         self._last += 1
         return self._last
 
-    def lease(self, object: str, worker: str, method: str = "cholesky", positions: bool = False) -> float:
+    def lease(
+        self, object: str, worker: str, method: str = "cholesky", positions: bool = False, blocks: int = 0
+    ) -> float:
         """Time [s] that the worker has for its answer; doubled after each job that expired.
 
-        MAX_LEASE for the first job of an object by a method, and the first that it assembles itself: it may import and
-        compile for that.
+        The longest there is, MAX_LEASE and more for large matrices, for the first job of an object by a method, and the
+        first that it assembles itself: it may import and compile for that.
         """
+        longest = MAX_LEASE * max(1.0, (blocks / LEASE_BLOCKS) ** 2)
         known = self._seconds.get(object, {}).get(worker)
         if known is None or (method, positions) not in self._answered.get((object, worker), ()):
-            return MAX_LEASE
+            return longest
         doublings = self._doublings.get((object, worker), 0)
-        return float(min(MAX_LEASE, max(MIN_LEASE, LEASE_FACTOR * known) * 2**doublings))
+        return float(min(longest, max(MIN_LEASE, LEASE_FACTOR * known) * 2**doublings))
 
     def exclusive_period(self, object: str, blocks: int) -> float:
         """Time [s] in which no other worker is asked for the object, by the duration at its fastest known worker."""
@@ -106,6 +116,7 @@ class Leases:
         """Adds a job that is being sent."""
         self.by_object[job.object] = job
         self.by_worker.setdefault(job.worker, {})[job.number] = job
+        self._deadlines = None
 
     def cancel(self, job: InFlightJob) -> None:
         """Removes a job that was never sent."""
@@ -117,6 +128,7 @@ class Leases:
         """Removes a job from those of its worker."""
         jobs = self.by_worker.get(job.worker, {})
         jobs.pop(job.number, None)
+        self._deadlines = None
         if not jobs:
             self.by_worker.pop(job.worker, None)
 
@@ -148,11 +160,11 @@ class Leases:
         """Number of expired jobs that a worker may still be busy with."""
         return len(self._expired.get(worker, ()))
 
-    def match_answer(self, number: int, worker: str, epoch: int) -> InFlightJob:
-        """Finds the job in flight that an answer belongs to; raises Refused if there is none."""
+    def match_answer(self, number: int, worker: str, epoch: int | None) -> InFlightJob:
+        """Finds the job in flight that an answer belongs to; raises Refused if there is none. epoch: None: not told"""
         job = self.by_worker.get(worker, {}).get(number)
         if job is not None:
-            if epoch != job.epoch:
+            if epoch is not None and epoch != job.epoch:
                 raise Refused(f"Factor.header.epoch is {epoch}; allowed: {job.epoch}, as in the matrix", "epoch")
             if self.by_object.get(job.object) is job or self.is_reassigned(job):
                 return job
@@ -181,9 +193,12 @@ class Leases:
             self._answered.setdefault((job.object, job.worker), set()).add((job.method, job.positions))
             self._doublings.pop((job.object, job.worker), None)
 
-    def expire(self, now: float) -> list[InFlightJob]:
-        """Ends the leases that are over: objects and workers are free again, the slots are not. Returns the jobs."""
-        return self._expire([job for job in self.jobs if now > job.deadline])
+    def expire(self, now: float, is_answered: Callable[[InFlightJob], bool] = lambda job: False) -> list[InFlightJob]:
+        """Ends the leases that are over: objects and workers are free again, the slots are not. Returns the jobs.
+
+        is_answered: the answer is there, and is taken in
+        """
+        return self._expire([job for job in self.jobs if now > job.deadline and not is_answered(job)])
 
     def expire_undelivered(
         self, sent_at: Callable[[InFlightJob], float], idle: Callable[[str], tuple[float, float] | None]
@@ -194,11 +209,12 @@ class Leases:
         idle: first and last time [s, monotonic] at which a worker reported without a break that it has no job
         """
 
-        def lost(job: InFlightJob) -> bool:
-            period = idle(job.worker)
-            return period is not None and period[1] - max(period[0], sent_at(job)) > self.delivery_time(job)
-
-        return self._expire([job for job in self.jobs if lost(job)])
+        lost = []
+        for worker, jobs in self.by_worker.items():
+            if (period := idle(worker)) is not None:
+                since = [(job, period[1] - max(period[0], sent_at(job))) for job in jobs.values()]
+                lost += [job for job, seconds in since if seconds > self.delivery_time(job)]
+        return self._expire(lost)
 
     def delivery_time(self, job: InFlightJob) -> float:
         """Time [s] that a job may need to reach its worker; doubled after each job that expired."""
@@ -235,6 +251,7 @@ class Leases:
             for pair in [pair for pair in known if pair[1] == worker]:
                 del known[pair]
         jobs = list(self.by_worker.pop(worker, {}).values())
+        self._deadlines = None
         for job in jobs:
             self._reassigned.discard(job.number)
             self._free_slots(job)
@@ -245,7 +262,10 @@ class Leases:
 
     def deadlines(self) -> dict[str, float]:
         """End of the lease [s, monotonic] of each busy worker."""
-        return {worker: max(job.deadline for job in jobs.values()) for worker, jobs in self.by_worker.items()}
+        if self._deadlines is None:
+            every = self.by_worker.items()
+            self._deadlines = {worker: max(job.deadline for job in jobs.values()) for worker, jobs in every}
+        return self._deadlines
 
     def _free_expired(self, worker: str, number: int) -> None:
         # A worker does its jobs in about the order in which they came: having answered this one it hardly writes to a

@@ -8,7 +8,7 @@
 import logging
 import os
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
@@ -37,18 +37,19 @@ from sim_server.updates.useless_factors import UselessFactors
 log = logging.getLogger(__name__)
 
 LARGE = 4 << 20  # bytes of a factor whose check takes more than a few milliseconds
+MANY = 8  # factors that came together, whose checks together take more than a few milliseconds
 MAX_CAUSES = 20  # reasons of missing factors that are logged of an object, each once
 
 
-class FactorUnderCheck(NamedTuple):
-    """A large factor that is checked beside the service thread.
+class FactorsUnderCheck(NamedTuple):
+    """A large factor, or many, that are checked beside the service thread.
 
-    memory: of the copy of its matrix, to be used again afterwards; None: there is none
+    memory: of the copy of the matrix of each, to be used again afterwards; None: there is none
     """
 
-    factor: Factor
-    memory: NDArray[np.float64] | None
-    reason: Future[str]
+    factors: Sequence[Factor]
+    memory: Sequence[NDArray[np.float64] | None]
+    reasons: Future[list[str]]
 
 
 class Driver:
@@ -89,7 +90,7 @@ class Driver:
         self.on_epoch: list[Callable[[Body, int], None]] = []  # called before the first job of an epoch of a body
         self.snapshots = SnapshotPool(simulation, self.source, self.policy.expected_latency)
         self.useless_factors = UselessFactors(self)
-        self.checks: list[FactorUnderCheck] = []  # oldest first
+        self.checks: list[FactorsUnderCheck] = []  # oldest first
         self._begin_checks()
         self._observer = SolveObserver(self)
         self._warped = {b.name: b.index in simulation.warped for b in world.bodies}
@@ -201,34 +202,46 @@ class Driver:
 
     # --- factors in ---------------------------------------------------------------------------------------------
 
-    def receive(self, source: FactorSource, on_factor: Callable[[Factor], None]) -> None:
+    def receive(self, source: FactorSource, on_factors: Callable[[Sequence[Factor]], None]) -> None:
         """Passes on the factors that a source has made since the last call, and takes note of failed jobs and of
         patterns that factors will have."""
         self._end_checks()
         for name, pattern in source.patterns():
             self.engine.expect_factors(self.by_name[name].body.index, pattern)
-        for factor in source.poll():
-            on_factor(factor)
+        if factors := source.poll():
+            on_factors(factors)
         for name, reason in source.failures():
             self.fail(name, reason)
 
-    def adopt(self, factor: Factor, now: bool = False) -> None:
-        """Puts a factor into its body's mailbox, unless a newer one is there or the check refuses it.
+    def adopt(self, factors: Sequence[Factor], now: bool = False) -> None:
+        """Puts factors into the mailboxes of their bodies, unless a newer one is there or the check refuses it.
 
-        The factor of a frozen body is not checked, since no solve uses it. now: a large one, too, is checked before
-        this returns; else, where no step waits for it, that is done beside the caller.
+        The factor of a frozen body is not checked, since no solve uses it. now: large ones, too, are checked before
+        this returns; else, where no step waits for them, that is done beside the caller, and so it is with many.
         """
-        state = self.by_name[factor.object]
-        is_new = factor.step > state.factors.newest and not state.frozen
-        beside = self.policy.free and factor.worker != Inline.WORKER and not now
-        if is_new and beside and factor.values.nbytes > LARGE:
-            memory, matrix = self.snapshots.hold(state, factor.step)
-            reason = self._checker.submit(self.check.reject_reason, factor, matrix)
-            self.checks.append(FactorUnderCheck(factor, memory, reason))
-            return
+        beside = self.policy.free and not now
+        together: list[Factor] = []
+        for factor in factors:
+            state = self.by_name[factor.object]
+            if factor.step <= state.factors.newest or state.frozen:
+                self.snapshots.release(state, factor.step)
+                self._take_up([factor], [""])
+            elif beside and factor.worker != Inline.WORKER and factor.values.nbytes > LARGE:
+                self._check_beside([factor])
+            else:
+                together.append(factor)
+        if beside and len(together) >= MANY and together[0].worker != Inline.WORKER:
+            self._check_beside(together)
+        elif together:
+            at_once = [(f, self.snapshots.release(self.by_name[f.object], f.step)) for f in together]
+            self._take_up(together, self.check.reject_reasons(at_once))
         self.policy.on_job_end()
-        matrix = self.snapshots.release(state, factor.step)
-        self._take_up(state, factor, self.check.reject_reason(factor, matrix) if is_new else "")
+
+    def _check_beside(self, factors: Sequence[Factor]) -> None:
+        held = [self.snapshots.hold(self.by_name[f.object], f.step) for f in factors]
+        checked = [(factor, matrix) for factor, (_, matrix) in zip(factors, held, strict=True)]
+        reasons = self._checker.submit(self.check.reject_reasons, checked)
+        self.checks.append(FactorsUnderCheck(factors, [memory for memory, _ in held], reasons))
 
     def _begin_checks(self) -> None:
         self._checker, self._process = ThreadPoolExecutor(1, "checks of factors"), os.getpid()
@@ -238,40 +251,53 @@ class Driver:
         if self._process != os.getpid():
             self._begin_checks()
             lost, self.checks = self.checks, []
-            for check in lost:
-                self.fail(check.factor.object, "its check ended with the process that it was in")
-        ended = [each for each in self.checks if each.reason.done()]
+            for factor in [factor for check in lost for factor in check.factors]:
+                self.fail(factor.object, "its check ended with the process that it was in")
+        ended = [each for each in self.checks if each.reasons.done()]
         for check in ended:
             self.checks.remove(check)
-            factor, state = check.factor, self.by_name[check.factor.object]
-            if check.memory is not None:
-                self.snapshots.recycle(check.memory)
-            if self.source.epoch(factor.object) not in (None, factor.epoch):
-                self.fail(factor.object, "it was of a mesh that was split since")
-                continue
+            for memory in check.memory:
+                if memory is not None:
+                    self.snapshots.recycle(memory)
+            good, reasons = [], []
+            for factor, reason in zip(check.factors, check.reasons.result(), strict=True):
+                if self.source.epoch(factor.object) not in (None, factor.epoch):
+                    self.fail(factor.object, "it was of a mesh that was split since")
+                    continue
+                good.append(factor)
+                reasons.append(reason)
             self.policy.on_job_end()
-            self._take_up(state, factor, check.reason.result())
+            self._take_up(good, reasons)
 
-    def _take_up(self, state: BodyUpdateState, factor: Factor, why: str) -> None:
-        """Puts a factor into its body's mailbox. why: it is not to be used; empty if it is."""
-        if why:
-            self.useless_factors.on_rejected(factor)
-            self.fail(factor.object, f"that of {factor.worker} is not used: {why}", refused=True)
-            return
-        # Post it, unless it is older than the newest
-        if not state.on_factor(factor, self.engine.step):
-            return
-        self.engine.post_factor(state.body.index, factor.pattern, factor.values, factor.step)
+    def _take_up(self, factors: Sequence[Factor], reasons: Sequence[str]) -> None:
+        """Puts factors into the mailboxes of their bodies. reasons: why each is not to be used; empty if it is."""
+        posted: list[Factor] = []
+        for factor, why in zip(factors, reasons, strict=True):
+            if why:
+                self.useless_factors.on_rejected(factor)
+                self.fail(factor.object, f"that of {factor.worker} is not used: {why}", refused=True)
+            elif self.by_name[factor.object].on_factor(factor, self.engine.step):  # else it is older than the newest
+                posted.append(factor)
+        bodies = [self.by_name[factor.object].body.index for factor in posted]
+        self.engine.post_factors(bodies, posted)
+        for factor in posted:
+            self._tell(self.by_name[factor.object], factor)
+
+    def _tell(self, state: BodyUpdateState, factor: Factor) -> None:
+        """Tells observers, and `auto`, of a factor that the loop was given."""
         if not self.policy.free:
             state.factors.kept = replace(factor, values=factor.values.copy())
         # Tell observers how it was made
-        method, extrapolated = state.factors.method(factor.step), state.job.extrapolated
-        at_end = Capability.MATRIX_POSITIONS not in self.engine.capabilities
-        later = state.job.positions and at_end and factor.worker != self.inline.WORKER
-        made = replace(factor, ahead=extrapolated, later=later) if extrapolated or later else factor
-        made = replace(made, method=method.name) if method else made
-        for observe in self.on_adopt:
-            observe(made)
+        method = state.factors.method(factor.step)
+        if self.on_adopt:
+            at_end = Capability.MATRIX_POSITIONS not in self.engine.capabilities
+            later = state.job.positions and at_end and factor.worker != self.inline.WORKER
+            name = method.name if method else factor.method
+            made = replace(
+                factor, ahead=state.job.extrapolated or factor.ahead, later=later or factor.later, method=name
+            )
+            for observe in self.on_adopt:
+                observe(made)
         # Let `auto` try it
         if state.tuner is not None:
             state.tuner.on_factor(method)

@@ -8,21 +8,23 @@ all of it; a factor that takes off less than block Jacobi does is worth less tha
 
 import ctypes as c
 import threading
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import cache
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from protocol.factor import Factor
+from protocol.factor import Factor, FactorPattern
+from sim_server.arrays import Int32
 from sim_server.backends.compiler import native
 from sim_server.backends.cpu import structs
-from sim_server.backends.cpu.engine import NativeFactor
+from sim_server.backends.cpu.engine import NativePattern
 from sim_server.updates.patterns import Patterns
 
 Reals = NDArray[np.float64]
 MAX_RESIDUAL = 0.05  # |r - A P^-1 r| / |r| of a factor that is to take the place of A; exact ones in float32 have 1e-3
+WORK = 8  # numbers for each degree of freedom
 MIN_SHARE = 0.9  # of what block Jacobi takes off, for a factor to be used; not 1, as one vector is not the space
 
 
@@ -44,10 +46,24 @@ class Probe(NamedTuple):
 @cache
 def _library() -> c.CDLL:
     p = c.c_void_p
-    arguments = [c.POINTER(structs.Factor), c.c_int32, p, p, p, p, p, p]
-    library = native("backends/cpu/native/factor_check.cpp", {"wf_judge": (None, arguments)}, stepping=False)
+    arguments = [c.c_int32, c.POINTER(structs.Factor), p, p, p, p, p, p, p]
+    library = native("backends/cpu/native/factor_check.cpp", {"wf_judge_all": (None, arguments)}, stepping=False)
     structs.LOOP.check_sizes(library)
     return library
+
+
+class CheckedBody:
+    """What the check needs of an object: its pattern, that of its factor, and where native code finds them."""
+
+    def __init__(self, row_start: Int32, columns: Int32, probe: Reals, pattern: FactorPattern):
+        self.row_start, self.columns, self.probe = row_start, columns, probe
+        self.factor_pattern = NativePattern(pattern)
+        self.addresses = tuple(each.ctypes.data for each in (row_start, columns, probe))
+
+    def fits(self, row_start: Int32, columns: Int32, pattern: FactorPattern) -> bool:
+        """True if the arrays are still those."""
+        known = self.row_start is row_start and self.columns is columns
+        return known and self.factor_pattern.pattern is pattern
 
 
 class FactorCheck:
@@ -61,25 +77,37 @@ class FactorCheck:
         self, patterns: Patterns | Mapping[str, tuple[NDArray[np.int32], NDArray[np.int32]]], alone: bool = False
     ):
         self._patterns, self._alone = patterns if isinstance(patterns, Patterns) else Patterns(patterns), alone
-        self._arrays: dict[int, tuple[Reals, Reals]] = {}  # by size: probe vector, work
+        self._vectors: dict[int, Reals] = {}  # probe vectors by size
+        self._work = np.empty(0)
+        self._bodies: dict[str, CheckedBody] = {}  # by object
         self._lock = threading.Lock()  # of these
 
     def prepare(self) -> None:
         """Compiles the native check, so that the first factor does not wait for it."""
         _library()
 
-    def reject_reason(self, factor: Factor, matrix: Reals | None) -> str:
-        """Returns why a factor is not to be used; empty if it is.
+    def reject_reasons(self, checked: Sequence[tuple[Factor, Reals | None]]) -> list[str]:
+        """Returns why each of some factors is not to be used; empty if it is. From any thread: native code is called
+        once, without Python's lock.
 
-        matrix: values (blocks, 3, 3) that it was made from; None: not known, and the test against block Jacobi is left
-            out
+        checked: factors, each with the values (blocks, 3, 3) that it was made from; None: not known, and the test
+            against block Jacobi is left out
         """
+        reasons = [self._wrong_size(factor) for factor, _ in checked]
+        fitting = [each for each, reason in zip(checked, reasons, strict=True) if not reason]
+        probes = iter(self.probe_all(fitting))
+        return [reason or self._useless(*each, next(probes)) for each, reason in zip(checked, reasons, strict=True)]
+
+    def _wrong_size(self, factor: Factor) -> str:
         nodes = len(self._patterns.at(factor.object, factor.epoch)[0]) - 1
         if factor.pattern.size != 3 * nodes:
             return f"its size is {factor.pattern.size}, that of the object {3 * nodes}"
         if len(factor.values) != factor.pattern.nonzeros:
             return f"it has {len(factor.values)} values, its pattern {factor.pattern.nonzeros}"
-        zr, reduction, block_jacobi, residual = self.probe(factor, matrix)
+        return ""
+
+    def _useless(self, factor: Factor, matrix: Reals | None, probe: Probe) -> str:
+        zr, reduction, block_jacobi, residual = probe
         if not 0 < zr < np.inf:
             return f"not positive definite or not finite (z.r = {zr:.3g} on a probe vector)"
         if matrix is not None and not reduction >= MIN_SHARE * block_jacobi:
@@ -95,22 +123,44 @@ class FactorCheck:
 
     def probe(self, factor: Factor, matrix: Reals | None) -> Probe:
         """Applies a factor, which has the right size, to the probe vector r. From any thread."""
-        with self._lock:
-            return self._probe(factor, matrix)
+        return self.probe_all([(factor, matrix)])[0]
 
-    def _probe(self, factor: Factor, matrix: Reals | None) -> Probe:
+    def probe_all(self, checked: Sequence[tuple[Factor, Reals | None]]) -> list[Probe]:
+        """Applies factors, each of which has the right size, to the probe vector r. From any thread."""
+        if not checked:
+            return []
+        with self._lock:
+            return self._probe_all(checked)
+
+    def _probe_all(self, checked: Sequence[tuple[Factor, Reals | None]]) -> list[Probe]:
+        count = len(checked)
+        factors, kept = (structs.Factor * count)(), []  # what is kept must live until the native code is done
+        nodes, pointers = np.zeros(count, np.int32), np.zeros((4, count), np.uintp)
+        for i, (factor, matrix) in enumerate(checked):
+            body, values = self._body(factor), np.ascontiguousarray(factor.values)
+            factors[i].pattern, factors[i].values = c.addressof(body.factor_pattern.native), values.ctypes.data
+            factors[i].step, factors[i].bytes = factor.step, values.itemsize
+            nodes[i] = len(body.row_start) - 1
+            pointers[:, i] = *body.addresses, 0 if matrix is None else matrix.ctypes.data
+            kept.append((body, values))
+        if (needed := WORK * 3 * int(nodes.max())) > len(self._work):
+            self._work = np.empty(needed)
+        out = np.zeros((count, 5))
+        row_start, columns, r, matrices = (each.ctypes.data for each in pointers)
+        _library().wf_judge_all(
+            count, factors, nodes.ctypes.data, row_start, columns, matrices, r, self._work.ctypes.data, out.ctypes.data
+        )
+        za = np.where(out[:, [1, 3]] > 0, out[:, [1, 3]], np.inf)
+        energy = out[:, [0, 2]] ** 2 / za
+        return [Probe(*row) for row in np.column_stack([out[:, 0], energy, out[:, 4]]).tolist()]
+
+    def _body(self, factor: Factor) -> CheckedBody:
         row_start, columns = self._patterns.at(factor.object, factor.epoch)
-        nodes = len(row_start) - 1
-        n = 3 * nodes
-        if n not in self._arrays:
-            self._arrays[n] = np.random.default_rng(0).standard_normal(n), np.empty(8 * n)
-        r, work = self._arrays[n]
-        native_factor = NativeFactor(factor.pattern, np.ascontiguousarray(factor.values), factor.step)
-        out = np.zeros(5)
-        values = None if matrix is None else matrix.ctypes.data
-        _library().wf_judge(
-            c.byref(native_factor.native), nodes, row_start.ctypes.data, columns.ctypes.data, values, r.ctypes.data,
-            work.ctypes.data, out.ctypes.data,
-        )  # fmt: skip
-        energy = [zr * zr / za if za > 0 else 0.0 for zr, za in (out[:2], out[2:4])]
-        return Probe(float(out[0]), energy[0], energy[1], float(out[4]))
+        known = self._bodies.get(factor.object)
+        if known is None or not known.fits(row_start, columns, factor.pattern):
+            size = 3 * (len(row_start) - 1)
+            if size not in self._vectors:
+                self._vectors[size] = np.random.default_rng(0).standard_normal(size)
+            known = CheckedBody(row_start, columns, self._vectors[size], factor.pattern)
+            self._bodies[factor.object] = known
+        return known

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Protocol
 
@@ -59,6 +59,10 @@ class FactorSource(Protocol):
     @abstractmethod
     def submit(self, job: Job) -> bool:
         """Hands a job over; False if no worker could take it."""
+
+    def submit_many(self, jobs: Sequence[Job]) -> list[bool]:
+        """Hands jobs of different objects over, the most urgent first; False for those that no worker could take."""
+        return [self.submit(job) for job in jobs]
 
     @abstractmethod
     def poll(self) -> list[Factor]:

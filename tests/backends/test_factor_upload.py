@@ -100,6 +100,11 @@ def post(upload: FactorUpload, value: int) -> None:
     upload.post(0, PATTERN, np.array([value]), value)
 
 
+def post_all(upload: FactorUpload, values: list[int]) -> None:
+    """Of each body, one that is made of another value."""
+    upload.post_many([(body, PATTERN, np.array([value]), value) for body, value in enumerate(values)])
+
+
 def used(scene: FakeScene) -> list[int]:
     return scene.loop.records()["factor_step"].tolist()
 
@@ -262,3 +267,77 @@ def test_other_errors_are_not_hidden(parts):
     maker.fail = RuntimeError("broken")
     with pytest.raises(RuntimeError, match="broken"):
         post(upload, 5)
+
+
+@pytest.fixture
+def many(parts, monkeypatch):
+    """Bodies enough for their factors to be many."""
+    scene, maker, _ = parts
+    maker.bodies = np.zeros(module.MANY, maker.bodies.dtype)
+    boxes = [Mailbox() for _ in maker.bodies]
+    stream = SimpleNamespace(synchronize=lambda: None)
+    gpu = SimpleNamespace(cp=SimpleNamespace(cuda=SimpleNamespace(get_current_stream=lambda: stream)))
+    return maker, FactorUpload(gpu, maker, scene.loop, [f"beam{k}" for k in range(len(boxes))], boxes), boxes
+
+
+class Mailbox:
+    """A mailbox whose mail the test takes."""
+
+    taken, posted = False, 0
+
+    def post(self, data: bytes, keep: Any = None, event: int | None = None) -> None:
+        self.taken, self.posted = False, keep.step
+
+
+def test_many_are_built_beside_the_caller(many):
+    """Who posts them waits for no build; each goes into the mailbox of its body once it is looked at again."""
+    maker, upload, boxes = many
+    go, build = threading.Event(), maker.build
+
+    def slow(*arguments: Any) -> PartitionedInverse:
+        assert go.wait(30)
+        return build(*arguments)
+
+    maker.build = slow
+    values = list(range(1, len(boxes) + 1))
+    post_all(upload, values)
+    upload.advance()
+    assert [box.posted for box in boxes] == [0] * len(boxes), "none is built yet"
+    go.set()
+    maker.thread.submit(lambda: None).result()
+    upload.advance()
+    assert [box.posted for box in boxes] == values
+    post_all(upload, [v + 10 for v in values])  # the mail waits: these do, too
+    assert len(maker.storages) == len(boxes)
+    for box in boxes:
+        box.taken = True
+    upload.advance()
+    maker.thread.submit(lambda: None).result()
+    upload.advance()
+    assert [box.posted for box in boxes] == [v + 10 for v in values] and len(maker.storages) == 2 * len(boxes)
+
+
+def test_few_are_built_at_once(many):
+    maker, upload, boxes = many
+    post_all(upload, [1, 2])
+    assert [box.posted for box in boxes[:2]] == [1, 2] and len(maker.storages) == 2
+
+
+def test_one_of_many_that_cannot_be_used_is_told_alone(many, caplog):
+    maker, upload, boxes = many
+    build = maker.build
+
+    def spoiled(values: np.ndarray, *arguments: Any) -> PartitionedInverse:
+        if values[0] == 2:
+            raise NoMemory("full")
+        return build(values, *arguments)
+
+    maker.build = spoiled
+    with caplog.at_level(logging.WARNING):
+        post_all(upload, list(range(1, len(boxes) + 1)))
+        maker.thread.submit(lambda: None).result()
+        upload.advance()
+    assert [box.posted for box in boxes] == [1, 0, *range(3, len(boxes) + 1)]
+    assert [r.message for r in caplog.records] == [
+        "object 'beam1': a factor cannot be used on the GPU: not enough GPU memory: full; it goes on with block Jacobi"
+    ]

@@ -3,6 +3,7 @@
 
 import dataclasses
 import logging
+from collections.abc import Sequence
 
 import numpy as np
 import pytest
@@ -74,8 +75,8 @@ def test_good_ones_pass(method, dtype, seed):
     factor = made(sim, method, dtype)
     for scale in (1.0, 1e6, 1e-6):  # the scale of a preconditioner does not matter
         scaled = dataclasses.replace(factor, values=factor.values * dtype(scale))
-        assert check.reject_reason(scaled, matrix) == ""
-    assert check.reject_reason(factor, None) == ""
+        assert check.reject_reasons([(scaled, matrix)])[0] == ""
+    assert check.reject_reasons([(factor, None)])[0] == ""
 
 
 @pytest.mark.parametrize("how", BAD)
@@ -83,13 +84,13 @@ def test_good_ones_pass(method, dtype, seed):
 def test_bad_ones_do_not(how, method):
     sim = bent()
     check, matrix = check_of(sim)
-    words = check.reject_reason(changed(made(sim, method), how), matrix)
+    words = check.reject_reasons([(changed(made(sim, method), how), matrix)])[0]
     assert "not positive definite or not finite" in words or "worse than block Jacobi" in words
     if how == "identity":
         assert "worse than block Jacobi" in words
     if how in ("nan", "infinite", "zero pivot"):
         assert "not finite" in words
-        assert "not finite" in check.reject_reason(changed(made(sim, method), how), None)
+        assert "not finite" in check.reject_reasons([(changed(made(sim, method), how), None)])[0]
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
@@ -98,26 +99,26 @@ def test_one_that_is_to_take_the_place_of_the_matrix_is_its_factor(dtype):
     sim = bent()
     check, matrix = check_of(sim, alone=True)
     good = made(sim, dtype=dtype)
-    assert check.reject_reason(good, matrix) == ""
+    assert check.reject_reasons([(good, matrix)])[0] == ""
     assert check.probe(good, matrix).residual < (1e-3 if dtype == np.float32 else 1e-9)
     flipped = good.values.copy()
     flipped[good.pattern.diagonal[-3]] *= -1
     wrong = [dataclasses.replace(good, values=v) for v in (good.values * dtype(1.1), flipped)]
     for factor in (*wrong, made(sim, GOOD[3], dtype)):
-        words = check.reject_reason(factor, matrix)
+        words = check.reject_reasons([(factor, matrix)])[0]
         assert "not that of its matrix: it leaves" in words and "at most 0.05" in words
     regularized = dataclasses.replace(good, values=good.values * dtype(1.1), remedy="shifted")
-    assert check.reject_reason(regularized, matrix) == "", "it cannot be"
+    assert check.reject_reasons([(regularized, matrix)])[0] == "", "it cannot be"
 
 
 def test_of_another_size():
     sim, other = bent(), simulation(bar((3, 2, 2), name="bar"))
     other.engine.assemble()
     check, matrix = check_of(sim)
-    assert "its size is 108, that of the object 162" in check.reject_reason(made(other), matrix)
+    assert "its size is 108, that of the object 162" in check.reject_reasons([(made(other), matrix)])[0]
     factor = made(sim)
     cut = dataclasses.replace(factor, values=factor.values[:-1])
-    assert f"it has {len(cut.values)} values" in check.reject_reason(cut, matrix)
+    assert f"it has {len(cut.values)} values" in check.reject_reasons([(cut, matrix)])[0]
 
 
 def test_the_energy_that_an_iteration_takes_off():
@@ -200,16 +201,17 @@ def test_the_copy_of_a_matrix_is_kept_until_its_factor_came(monkeypatch):
     driver = driven("async", {})
     seen: list[tuple[int, bool]] = []
     places: set[int] = set()
-    reject_reason = driver.check.reject_reason
+    reject_reasons = driver.check.reject_reasons
 
-    def looked(factor: Factor, matrix: NDArray | None) -> str:
-        values = matrix if matrix is not None else np.zeros(1)
-        fresh = made_of(driver, values) if matrix is not None else None
-        places.add(values.ctypes.data)
-        seen.append((factor.step, fresh is not None and np.array_equal(fresh, factor.values)))
-        return reject_reason(factor, matrix)
+    def looked(checked: Sequence[tuple[Factor, NDArray | None]]) -> list[str]:
+        for factor, matrix in checked:
+            values = matrix if matrix is not None else np.zeros(1)
+            fresh = made_of(driver, values) if matrix is not None else None
+            places.add(values.ctypes.data)
+            seen.append((factor.step, fresh is not None and np.array_equal(fresh, factor.values)))
+        return reject_reasons(checked)
 
-    monkeypatch.setattr(driver.check, "reject_reason", looked)
+    monkeypatch.setattr(driver.check, "reject_reasons", looked)
     driver.advance(20)
     assert len(seen) > 5 and all(same for _, same in seen)
     assert len(places) <= 2

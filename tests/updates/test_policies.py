@@ -419,7 +419,7 @@ def test_an_older_factor_does_not_replace_a_newer_one():
     sim.engine.assemble()
     values = sim.system.values.copy()
     for step, used in ((5, 5), (3, 5), (5, 5), (7, 7)):
-        driver.adopt(made(driver, step, values))
+        driver.adopt([made(driver, step, values)])
         assert driver.advance(1)["factor_step"].tolist() == [used]
     assert driver.bodies[0].factors.used == 2
 
@@ -436,24 +436,24 @@ def sent(monkeypatch) -> tuple[Driver, Factor, threading.Event]:
     assert state.job.matrix is not None
     step, values = state.job.matrix
     factor = replace(made(driver, step, values), worker="w")
-    check = driver.check.reject_reason
+    check = driver.check.reject_reasons
 
-    def slow(*arguments: Any) -> str:
+    def slow(*arguments: Any) -> list[str]:
         go.wait(30)
         return check(*arguments)
 
-    monkeypatch.setattr(driver.check, "reject_reason", slow)
+    monkeypatch.setattr(driver.check, "reject_reasons", slow)
     return driver, factor, go
 
 
 def test_large_factors_are_checked_beside_the_steps(sent):
     driver, factor, go = sent
     memory = driver.bodies[0].job.matrix[1]
-    driver.adopt(factor)
+    driver.adopt([factor])
     assert driver.advance(2)["factor_step"].tolist() == [-1, -1]
     assert all(memory is not free for kept in driver.snapshots.free.values() for free in kept), "it is being read"
     go.set()
-    wait([each.reason for each in driver.checks])
+    wait([each.reasons for each in driver.checks])
     assert driver.advance(1)["factor_step"].tolist() == [factor.step]
     assert any(memory is free for kept in driver.snapshots.free.values() for free in kept)
     assert driver.bodies[0].factors.used == 1 and driver.checks == []
@@ -461,9 +461,9 @@ def test_large_factors_are_checked_beside_the_steps(sent):
 
 def test_a_large_factor_that_is_no_use_is_refused_beside_the_steps(sent):
     driver, factor, go = sent
-    driver.adopt(replace(factor, values=np.full_like(factor.values, np.nan)))
+    driver.adopt([replace(factor, values=np.full_like(factor.values, np.nan))])
     go.set()
-    wait([each.reason for each in driver.checks])
+    wait([each.reasons for each in driver.checks])
     assert driver.advance(2)["factor_step"].tolist() == [-1, -1]
     assert driver.bodies[0].failures.refused == 1 and not driver.bodies[0].job.in_flight
 

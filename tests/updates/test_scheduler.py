@@ -263,3 +263,29 @@ def test_nobody_starves(rule, rounds, workers):
 def test_without_a_bound_the_calm_would_starve():
     """What test_nobody_starves guards against does happen otherwise."""
     assert oldest_seen("excess", [1, 2, 5], {0: 50.0, 1: 80.0}, 1, math.inf) > 2900
+
+
+@pytest.mark.parametrize("places", [1, 7, 64])
+@pytest.mark.parametrize("spread", [0, 5])
+@pytest.mark.parametrize("rule", RULES)
+def test_of_equal_needs_the_oldest_goes_first(rule, spread, places):
+    """Many bodies that lose the same, in any order and with factors that take one to 1 + spread steps: none waits
+    longer than the workers need for all of the others, and then as long as a factor takes."""
+    bodies, rng = 100, np.random.default_rng(places + spread)
+    sent, newest, comes = np.full(bodies, -1), np.full(bodies, -1), np.full(bodies, -1)
+    order, oldest = rng.permutation(bodies), 0
+    for step in range(600):
+        came = comes == step
+        newest[came], comes[came] = sent[came], -1
+        flying, excess = comes >= 0, np.ones(bodies)
+        rows = UpdateRequests(
+            np.arange(bodies), excess, np.where(sent >= 0, step - sent, -1), flying, step - newest, excess, excess,
+            np.zeros(bodies, int), excess, np.zeros(bodies, bool), excess,
+        ).of(order)  # fmt: skip
+        chosen = pick(rows, places - int(flying.sum()), rule=rule)
+        sent[chosen] = step
+        comes[chosen] = step + 1 + rng.integers(0, spread + 1, len(chosen))
+        if step >= 300:
+            oldest = max(oldest, int((step - newest).max()))
+    longest = 1 + spread
+    assert oldest <= math.ceil(bodies / places) * longest + 2 * longest

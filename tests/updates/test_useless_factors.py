@@ -138,7 +138,7 @@ def test_a_refused_factor_is_told() -> None:
     body = driver.simulation.world.bodies[0]
     row_start, columns = driver.simulation.system.body_pattern(body.first, body.last)
     pattern = make_factorization(row_start, columns, driver.solver.method).pattern
-    driver.adopt(Factor("bar", 1, 5, False, pattern, values, "w", 0.1, ""))
+    driver.adopt([Factor("bar", 1, 5, False, pattern, values, "w", 0.1, "")])
     assert source.told == [("no use", "w", "bar")]
 
 

@@ -16,7 +16,7 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from protocol.factor import FactorPattern
+from protocol.factor import Factor, FactorPattern
 from sim_server.arrays import Int32
 from sim_server.backends.base import ArrayChange, Capability, CutInput, EngineInput, Launch
 from sim_server.backends.central_difference import NODAL as NODAL_OF_SUBSTEPS
@@ -84,6 +84,9 @@ class NativePattern:
         return bool(self.native.plan)
 
 
+KEPT = 16 << 20  # bytes of a factor above which its values are kept instead of copied
+
+
 class NativeFactor:
     """A factor in memory that native code can apply: to the given values, which are not copied."""
 
@@ -107,8 +110,13 @@ class NativeFactor:
         return c.addressof(self.native)
 
     def fill(self, values: NDArray[Any], step: int) -> None:
-        """Copies the values of L made from the matrix of `step`."""
-        self.values[:] = values
+        """Takes the values of L made from the matrix of `step`: copies them, or keeps those of a large factor, which
+        would fill the memory once more."""
+        if values.nbytes > KEPT:
+            self.values = np.ascontiguousarray(values)
+            self.native.values = self.values.ctypes.data
+        else:
+            self.values[:] = values
         self.native.step = step
 
     def apply(self, r: Reals, threads: int = 1) -> Reals:
@@ -765,11 +773,16 @@ class CpuEngine(Reports):
     # --- mailboxes ----------------------------------------------------------------------------------------------
 
     def post_factor(self, body: int, pattern: FactorPattern, values: NDArray[Any], step: int) -> None:
-        """Copies a factor into a free buffer; the loop takes it up before its next solve of the body."""
+        """Puts a factor into a free buffer; the loop takes it up before its next solve of the body."""
         buffer = self._free_buffer(body, pattern, values.dtype)
         buffer.fill(values, step)
         self._mail[body].waiting = buffer
         self._native.wf_post_factor(c.byref(self._body[body]), buffer.address)
+
+    def post_factors(self, bodies: Sequence[int], factors: Sequence[Factor]) -> None:
+        """Posts factors of different bodies, one of each."""
+        for body, factor in zip(bodies, factors, strict=True):
+            self.post_factor(body, factor.pattern, factor.values, factor.step)
 
     def prepare_for_factors(self) -> None:
         """Does nothing."""

@@ -13,7 +13,7 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from protocol.factor import FactorPattern
+from protocol.factor import Factor, FactorPattern
 from sim_server.arrays import Float64
 from sim_server.backends.base import ArrayChange, Capability, EngineInput, Launch
 from sim_server.backends.cpu.structs import REACTION
@@ -456,6 +456,12 @@ class GpuEngine(DeviceLoop):
     def post_factor(self, body: int, pattern: FactorPattern, values: NDArray[Any], step: int) -> None:
         """Builds the inverse of a factor beside the steps; it is used from the first batch after its completion on."""
         self._factor_upload.post(body, pattern, values, step)
+
+    def post_factors(self, bodies: Sequence[int], factors: Sequence[Factor]) -> None:
+        """Posts factors of different bodies, one of each; inverses of many are built beside the caller."""
+        self._factor_upload.post_many(
+            [(body, f.pattern, f.values, f.step) for body, f in zip(bodies, factors, strict=True)]
+        )
 
     def prepare_for_factors(self) -> None:
         """Has the kernels that build inverses of factors compiled beside the caller."""

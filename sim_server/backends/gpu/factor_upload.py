@@ -3,8 +3,8 @@
 
 Each body has two storages per pattern (double buffering). A build begins once the inverse before it is in use and no
 step under way reads the other storage. A factor that arrives earlier is queued; a newer one replaces it. Plans, made
-once per pattern, and the copies of large factors are left to a thread (PcgSolver.beside), for which the thread that
-serves the loop does not wait.
+once per pattern, and the copies of large factors, or of many, are left to a thread (PcgSolver.beside), for which the
+thread that serves the loop does not wait.
 """
 
 import logging
@@ -28,6 +28,7 @@ from sim_server.backends.gpu.solver import SETTINGS_BYTES, PcgSolver, PlannedInv
 log = logging.getLogger(__name__)
 
 SMALL = 1 << 20  # bytes of a factor that is copied at once
+MANY = 4  # small factors that come together, from which on none is built at once
 MAX_PATTERNS = 2  # of a body at a time; workers with different libraries send different patterns
 
 
@@ -114,12 +115,22 @@ class FactorUpload:
             uploads.queued = GivenFactor(pattern, values, step)
             self._begin_queued(body)
 
+    def post_many(self, given: Sequence[tuple[int, FactorPattern, NDArray[Any], int]]) -> None:
+        """Takes factors of different bodies, each as `post` takes one. Inverses of many are built beside the caller,
+        who would wait for one after another."""
+        with self._lock:
+            for body, pattern, values, step in given:
+                self._refresh(body)
+                self._uploads[body].queued = GivenFactor(pattern, values, step)
+                self._begin_queued(body, len(given) >= MANY)
+
     def advance(self) -> None:
         """Posts what was built beside the caller, and begins the builds that have waited for a storage."""
         with self._lock:
-            for body in sorted(self._waiting):
+            waiting = sorted(self._waiting)
+            for body in waiting:
                 self._refresh(body)
-                self._begin_queued(body)
+                self._begin_queued(body, len(waiting) >= MANY)
 
     def settle(self) -> None:
         """Waits until the next step will use the newest factors. Only while the loop stands still."""
@@ -165,25 +176,25 @@ class FactorUpload:
         if uploads.leaving is not None and self._loop.step >= uploads.leaving[1]:
             uploads.leaving = None
 
-    def _begin_queued(self, body: int) -> None:
-        """Begins to build the queued factor, if there is one and it need not wait."""
+    def _begin_queued(self, body: int, beside: bool = False) -> None:
+        """Begins to build the queued factor, if there is one and it need not wait. beside: not in this thread"""
         uploads = self._uploads[body]
         if uploads.queued is not None and uploads.free:
             given, uploads.queued = uploads.queued, None
-            self._begin(body, given)
+            self._begin(body, given, beside)
         if uploads.queued is None and uploads.building is None:
             self._waiting.discard(body)
         else:
             self._waiting.add(body)
 
-    def _begin(self, body: int, given: GivenFactor) -> None:
-        """Builds an inverse: at once if it is small and its plan is there, else in the thread of the plans."""
+    def _begin(self, body: int, given: GivenFactor, beside: bool) -> None:
+        """Builds an inverse: at once if it is small, planned and not `beside`, else in the thread of the plans."""
         uploads = self._uploads[body]
         plan = self._solver.begin_plan(body, given.pattern)
         used = uploads.in_use.storage if uploads.in_use else None
         spare = next((s for s in uploads.storages.get(given.pattern.id, []) if s is not used), None)
         build = partial(self._build, plan, given, spare)
-        if plan.done() and given.values.nbytes <= SMALL:
+        if plan.done() and given.values.nbytes <= SMALL and not beside:
             self._finish(body, given.pattern, build)
         else:
             uploads.building = self._solver.beside(build), given

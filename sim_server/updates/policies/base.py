@@ -41,9 +41,9 @@ class UpdatePolicy(ABC):
     def max_age(self) -> int:
         """Returns the age [steps] that no factor exceeds while all goes well; -1: no bound is known."""
 
-    def on_factor(self, factor: Factor) -> None:
-        """Takes a factor that has arrived: uses it or keeps it for later."""
-        self.driver.adopt(factor)
+    def on_factors(self, factors: Sequence[Factor]) -> None:
+        """Takes factors that have arrived: uses them or keeps them for later."""
+        self.driver.adopt(factors)
 
     def on_job_end(self) -> None:
         """Takes note that an object may be sent again, as its job has brought a factor or failed."""

@@ -11,6 +11,7 @@ import numpy as np
 
 from sim_server.arrays import Float64
 from sim_server.updates.body_state import BodyUpdateState
+from sim_server.updates.factor_source import Job
 from sim_server.updates.policies.base import UpdatePolicy
 from sim_server.updates.prefetch import PrefetchDepth
 from sim_server.updates.scheduler import (
@@ -65,7 +66,7 @@ class Async(UpdatePolicy):
         """Takes up factors and sends the matrices that were copied."""
         driver, source = self.driver, self.driver.source
         # Take up factors; bodies whose worker is slow may be sent again
-        driver.receive(source, self.on_factor)
+        driver.receive(source, self.on_factors)
         for name in source.reassigned():
             driver.snapshots.release(driver.by_name[name])
             driver.by_name[name].on_reassignment()
@@ -126,22 +127,20 @@ class Async(UpdatePolicy):
         driver = self.driver
         copied = driver.snapshots.completed()
         idle = driver.source.ready() if copied else 0
+        made: list[tuple[BodyUpdateState, Job]] = []
         for state in copied:
             waited = driver.engine.step - driver.snapshots.step(state)
-            if idle <= 0 and self.prefetch.depth and waited <= MAX_WAIT:
+            if idle <= len(made) and self.prefetch.depth and waited <= MAX_WAIT:
                 continue
-            idle -= self._send(state)
-
-    def _send(self, state: BodyUpdateState) -> bool:
-        """Sends a copy. False: it does not suffice or no worker takes it, and it is discarded."""
-        job = self.driver.make_job(state)
-        if job is None:
-            return False
-        if not self.driver.source.submit(job):
-            self.driver.snapshots.discard(state)
-            return False
-        state.on_sent(job.step)
-        return True
+            if (job := driver.make_job(state)) is not None:
+                made.append((state, job))
+        if not made:
+            return
+        for (state, job), taken in zip(made, driver.source.submit_many([job for _, job in made]), strict=True):
+            if taken:
+                state.on_sent(job.step)
+            else:
+                driver.snapshots.discard(state)
 
     def _overdue(self) -> float:
         """Returns the steps after which a body goes next whatever the rule."""

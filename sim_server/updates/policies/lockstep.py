@@ -70,9 +70,10 @@ class Lockstep(UpdatePolicy):
         """Returns 2 n - 1: a factor is n steps old when it comes, and stays for n steps."""
         return 2 * self.n - 1
 
-    def on_factor(self, factor: Factor) -> None:
-        """Keeps a factor until it is due."""
-        self._arrived[factor.object, factor.step] = factor
+    def on_factors(self, factors: Sequence[Factor]) -> None:
+        """Keeps factors until they are due."""
+        for factor in factors:
+            self._arrived[factor.object, factor.step] = factor
 
     def take_back(self, jobs: Sequence[Job]) -> None:
         """Has the jobs sent again before the next step."""
@@ -94,7 +95,7 @@ class Lockstep(UpdatePolicy):
                 begun = time.monotonic()
             time.sleep(POLL_PERIOD)
         if factor := self._arrived.pop((name, made), None):
-            driver.adopt(factor)
+            driver.adopt([factor])
             driver.engine.settle_factors()
         for late in [key for key in self._arrived if key[0] == name]:  # of a job that was given up
             del self._arrived[late]
@@ -102,7 +103,7 @@ class Lockstep(UpdatePolicy):
 
     def _collect(self) -> None:
         for source in {id(s): s for s in (self.driver.source, self.driver.inline)}.values():
-            self.driver.receive(source, self.on_factor)
+            self.driver.receive(source, self.on_factors)
 
     def _send(self, state: BodyUpdateState) -> bool:
         """Sends the copied matrix to a worker as soon as one is idle; factorizes it in this process if there is no

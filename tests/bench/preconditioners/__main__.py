@@ -89,7 +89,7 @@ def round_of(found: Found, name: str, cells: tuple[int, int, int], steps: int, l
     sim.engine.assemble()
     matrix = sim.system.body_values(body.first, body.last)
     guard = FactorCheck({body.name: sim.system.body_pattern(body.first, body.last)})
-    found.guard = 1e3 * best_of(10, lambda: guard.reject_reason(last, matrix))
+    found.guard = 1e3 * best_of(10, lambda: guard.reject_reasons([(last, matrix)]))
 
 
 def diagram(rows: list[dict[str, Any]]) -> Any:

@@ -14,6 +14,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -21,7 +22,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from protocol.factor import FactorPattern
+from protocol.factor import Factor
 from sim_server.backends.cpu.structs import RECORD
 from sim_server.backends.kinds import Kind
 from sim_server.network.link import ServerLink
@@ -67,11 +68,11 @@ class PacedLoop:
         """Step of the copy; -1: there is none yet."""
         return int(self._copied[body])
 
-    def post_factor(self, body: int, pattern: FactorPattern, values: NDArray[Any], step: int) -> None:
-        """Takes a factor as the engine does."""
-        self._engine.post_factor(body, pattern, values, step)
-        self._factors[body] = step
-        self.posted += 1
+    def post_factors(self, bodies: Sequence[int], factors: Sequence[Factor]) -> None:
+        """Takes factors as the engine does."""
+        self._engine.post_factors(bodies, factors)
+        self._factors[list(bodies)] = [factor.step for factor in factors]
+        self.posted += len(bodies)
 
     def records_and_reactions(self) -> tuple[NDArray[Any], NDArray[np.float64]]:
         """Records of the steps that are due."""

@@ -65,7 +65,7 @@ def _first_factors(driver: Driver) -> None:
     for body in driver.simulation.world.bodies:
         driver.inline.submit(Job(body.name, 1, 0, True, system.body_values(body.first, body.last)))
     for factor in driver.inline.poll():
-        driver.adopt(factor)
+        driver.adopt([factor])
 
 
 def _figures(iterations: NDArray[Any], age: NDArray[Any], wild: NDArray[np.bool_]) -> dict[str, Any]:

@@ -26,6 +26,13 @@ void wf_judge(const Factor* factor, int32_t nodes, const int32_t* row_start, con
     out[3] = multiply(A, z, q);
 }
 
+// The same of `count` factors, one after another; entry i of each array is of factor i. work: for the largest of them. out: (count, 5)
+void wf_judge_all(int32_t count, const Factor* factors, const int32_t* nodes, const int32_t* const* row_start,
+                  const int32_t* const* columns, const double* const* values, const double* const* r, double* work, double* out) {
+    for (int i = 0; i < count; ++i)
+        wf_judge(factors + i, nodes[i], row_start[i], columns[i], values[i], r[i], work, out + 5 * i);
+}
+
 const StructSize* wf_sizes() {
     static const StructSize sizes[] = {SIZE(Factor), SIZE(Pattern), {}};
     return sizes;

@@ -48,6 +48,7 @@ struct Record {
     int32_t passes = 0;         // solves for them
     int32_t clipped = 0;        // nodes held back at an obstacle beside the law
     int32_t halvings = 0;       // the step was made again by 2^halvings short ones; 0: it was not
+    int32_t at_rest = 0;        // 1: nothing was solved, since b of a body at rest is rounding, as the residual is; it says converged
     int32_t substeps = 0;       // explicit ones of the step; 0: an implicit scheme
     double stable_step = NAN;   // largest stable substep as estimated last [s]; NaN: an implicit scheme
     double solve_error = NAN;   // estimated, of the positions, by the last linear solve, largest of a node [m]; NaN: not known
@@ -66,6 +67,7 @@ template <class B> static inline void note_energy(Record& record, const B& b) {
     if (b.phase != WELL && (rests || record.status != NOT_FINITE)) record.status = RUNAWAY;
     if (!rests) return;
     record.factor_step = -1;  // there was nothing to solve
+    record.at_rest = 0;
     record.kind = record.asked;
 }
 
@@ -93,7 +95,8 @@ struct Rings {
     std::atomic<int64_t> frames_dropped, records_dropped, late_steps;
     int32_t realtime;                      // keep pace with the wall clock
     int32_t patient;                       // wait for room in the rings instead of dropping (no deadline to miss)
-    std::atomic<int32_t> stop, pause;
+    std::atomic<int32_t> stop;
+    std::atomic<int32_t> pause, halted;    // number of a pause, 0: none; the pause in which the loop stands still, 0: it does not
     std::atomic<int64_t> single;           // steps that the loop is to make while it is paused
     std::atomic<int64_t> hold, held;       // number of a request to stand still between two steps, 0: none; the last one that it has followed
     double deadline;                       // steady clock, of the next step; 0: now
@@ -140,6 +143,7 @@ static inline Record make_record(const Rings& rings, int64_t step, int32_t body,
     record.status = solve.status;
     record.kind = solve.kind;
     record.fallbacks = solve.fallbacks;
+    record.at_rest = solve.at_rest;
     return record;
 }
 
@@ -190,17 +194,18 @@ template <class Meanwhile>
 static bool wait_until_due(Rings& rings, Meanwhile meanwhile) {
     while (!rings.stop.load()) {
         const int64_t request = rings.hold.load();
-        const bool paused = rings.pause.load(std::memory_order_relaxed) && rings.single.load() <= 0;
-        if (!request && !paused) break;
+        const int32_t pause = rings.single.load() <= 0 ? rings.pause.load() : 0;
+        if (!request && !pause) break;
         meanwhile();
         if (request) rings.held.store(request);
+        if (pause) {
+            rings.deadline = 0;
+            rings.halted.store(pause);
+        }
         nap(request ? 1e-4 : 1e-3);
-        if (paused) rings.deadline = 0;
     }
-    if (rings.pause.load(std::memory_order_relaxed) && rings.single.load() > 0) {  // a deadline of 0 would say that it stands still
-        if (rings.deadline == 0) rings.deadline = rings.realtime ? now() : -1;
-        rings.single.fetch_sub(1);
-    }
+    rings.halted.store(0);  // before `single` says that no step is left
+    if (rings.pause.load() && rings.single.load() > 0) rings.single.fetch_sub(1);
     rings.late = 0;
     if (rings.realtime && !rings.stop.load()) {
         double t = now();

@@ -85,13 +85,15 @@ def _worker(name: str, servers: Sequence[str]) -> list[dict[str, Any]]:
         return [_own(channel, server, own) for server in servers for channel in channels]
 
     return [
-        _rule(["put"], ["ingress"], keys("factor", "pattern", "worker")),
-        _rule(["put"], ["egress"], keys("matrix", "worker")),
-        _rule(["declare_subscriber"], ["ingress"], keys("matrix", "worker")),
-        _rule(["declare_subscriber"], ["egress"], keys("factor", "pattern", "worker")),
+        _rule(["put"], ["ingress"], keys("factor", "factors", "pattern", "worker")),
+        _rule(["put"], ["egress"], keys("matrix", "matrices", "worker")),
+        _rule(["declare_subscriber"], ["ingress"], keys("matrix", "matrices", "worker")),
+        _rule(["declare_subscriber"], ["egress"], keys("factor", "factors", "pattern", "worker")),
         _rule(["declare_subscriber"], ["ingress"], [key("need", "*")]),
         _rule(["put"], ["egress"], [key("need", "*")]),
         _rule(["query"], ["ingress"], keys("topology", "scene", "echo")),
+        _rule(["query"], ["egress"], keys("part")),
+        _rule(["declare_queryable", "reply"], ["ingress"], keys("part")),
         _rule(["liveliness_token"], ["ingress", "egress"], keys("alive_worker")),
         _rule(["liveliness_query"], ["ingress"], keys("alive_worker")),
     ]
@@ -102,7 +104,8 @@ def _own(channel: str, server: str, own: str, verb: str = "*") -> str:
     mark = "-own-"
     names = {"command": {"verb": verb, "client": mark}, "alive_client": {"client": mark}}.get(channel)
     if names is None:
-        names = {"worker": mark} if channel in ("matrix", "pattern", "factor", "worker", "echo", "alive_worker") else {}
+        of_workers = ("matrix", "matrices", "pattern", "factor", "factors", "part", "worker", "echo", "alive_worker")
+        names = {"worker": mark} if channel in of_workers else {}
     return key(channel, server, **names).replace(mark, own)
 
 

@@ -1,0 +1,140 @@
+# SPDX-License-Identifier: MIT
+"""Jobs that came in one message, and their answers, which leave in one message."""
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import zenoh
+from numpy.typing import NDArray
+
+from precond_worker.arrays import Float64, Int64
+from protocol.channels import CHANNELS, MOST_JOBS
+from protocol.factor import FactorPattern
+from protocol.messages_pb2 import FactorBatch, Header, Matrix, MatrixBatch
+from protocol.refused import Refused
+from protocol.shared_memory.pool import HEADER
+from protocol.shared_memory.view import SlotMap
+from protocol.validate import array, check_header, check_strings, checksum, parse, take
+
+ENTRY = 9  # values of a block
+ALIGNMENT = 64  # bytes to which the room of a factor is rounded up
+
+
+@dataclass(eq=False)
+class Batch:
+    """A message with several jobs; shared: its values came by reference."""
+
+    message: MatrixBatch
+    payload: zenoh.ZBytes
+    shared: bool
+
+    @cached_property
+    def starts(self) -> Int64:
+        """Index of the first value of each matrix, and the number of all, (jobs + 1,)."""
+        return np.concatenate([[0], np.cumsum(ENTRY * np.array(self.message.blocks, np.int64))])
+
+    @cached_property
+    def rooms(self) -> Int64:
+        """First byte of the room of each factor, and the bytes of all, (jobs + 1,)."""
+        return np.concatenate([[0], np.cumsum(np.array(self.message.rooms, np.int64))])
+
+    def matrix(self, place: int, slots: SlotMap) -> Float64:
+        """Returns the values of one of the matrices, in place if in shared memory; raises Refused."""
+        begin, end, all_of_them = (int(n) for n in self.starts[[place, place + 1, -1]])
+        if self.shared:
+            return slots.array(self.message.matrix_slot, np.float64, all_of_them)[begin:end]
+        data = take(self.payload, CHANNELS["matrices"].bulk, "MatrixBatch payload")
+        copied = data[HEADER + 8 * begin : HEADER + 8 * end]  # a reader without shared memory gets the whole slot
+        return array(copied, np.float64, (end - begin,), "MatrixBatch payload")
+
+    def entry(self, place: int) -> Matrix:
+        """Returns one of the jobs as it would come alone, without slots."""
+        m = self.message
+        first = sum(m.known[:place])
+        header = Header(
+            protocol=m.header.protocol, incarnation=m.header.incarnation, object=m.objects[place],
+            epoch=m.epochs[place], sequence=m.jobs[place],
+        )  # fmt: skip
+        return Matrix(
+            header=header, step=m.steps[place], warp=m.warps[place], blocks=m.blocks[place],
+            checksum=m.checksums[place], factor_dtype=m.factor_dtype, method=m.method,
+            known_patterns=m.known_patterns[first : first + m.known[place]], lease=m.leases[place], worker=m.worker,
+            drop_tolerance=m.drop_tolerance, fill=m.fill, omega=m.omega,
+        )  # fmt: skip
+
+
+def accept_batch(sample: zenoh.Sample, worker: str, incarnation: int) -> Batch:
+    """Checks a sample with several jobs but for the values, which are checked one by one; raises Refused."""
+    message = parse(MatrixBatch, sample.attachment, CHANNELS["matrices"].limit)
+    check_header(message, incarnation=incarnation)
+    check_strings(message, 256)
+    if message.worker != worker:
+        raise Refused(f"MatrixBatch is for {message.worker!r}, its key is {sample.key_expr}", "worker")
+    count = len(message.jobs)
+    columns = ("objects", "epochs", "steps", "warps", "blocks", "checksums", "rooms", "leases", "known")
+    lengths = {name: len(getattr(message, name)) for name in columns}
+    if not 0 < count <= MOST_JOBS or any(length != count for length in lengths.values()):
+        raise Refused(f"MatrixBatch.jobs has {count} numbers, other fields {lengths}; allowed: as many", "shape")
+    if sum(message.known) != len(message.known_patterns):
+        raise Refused(f"MatrixBatch.known_patterns has {len(message.known_patterns)}, not those of `known`", "shape")
+    shared = sample.payload.as_shm() is not None
+    batch = Batch(message, sample.payload, shared)
+    for slot, needed in ((message.matrix_slot, 8 * batch.starts[-1]), (message.factor_slot, batch.rooms[-1])):
+        if needed > slot.capacity:
+            raise Refused(f"MatrixBatch has a slot of {slot.capacity} bytes; needed: {needed}", "slot")
+    if any(room % ALIGNMENT for room in message.rooms):
+        raise Refused(f"MatrixBatch.rooms: not all are multiples of {ALIGNMENT}", "slot")
+    return batch
+
+
+class BatchAnswer:
+    """Answers to jobs of one batch, until they are sent."""
+
+    def __init__(self, batch: Batch, header: Header, worker: str):
+        self._batch = batch
+        self.message = FactorBatch(
+            header=header, worker=worker, slot=batch.message.factor_slot, matrix_shared=batch.shared
+        )
+        self._failures: list[str] = []
+        self._remedies: list[str] = []
+
+    def add(
+        self, place: int, slots: SlotMap, pattern: FactorPattern, values: NDArray[Any], seconds: float, remedy: str
+    ) -> bool:  # fmt: skip
+        """Writes a factor into its room; False if it is too large for it. Raises Refused if this answer is late."""
+        batch, slot = self._batch, self._batch.message.factor_slot
+        begin, end, all_of_them = (int(n) for n in batch.rooms[[place, place + 1, -1]])
+        if values.nbytes > end - begin:
+            return False
+        room = slots.array(slot, np.uint8, all_of_them)[begin : begin + values.nbytes]
+        if not slots.is_current(slot):
+            raise Refused("the slot for factors was lent to somebody else: this answer is late", "late")
+        np.copyto(room.view(values.dtype), values)
+        self._add(place, pattern.id, pattern.nonzeros, checksum(values), seconds, "", remedy)
+        return True
+
+    def add_failure(self, place: int, failure: str) -> None:
+        """Adds why a job has no factor."""
+        self._add(place, 0, 0, 0, 0.0, failure, "")
+
+    def _add(
+        self, place: int, pattern: int, nonzeros: int, check: int, seconds: float, failure: str, remedy: str
+    ) -> None:  # fmt: skip
+        m = self.message
+        m.jobs.append(self._batch.message.jobs[place])
+        m.patterns.append(pattern)
+        m.nonzeros.append(nonzeros)
+        m.checksums.append(check)
+        m.seconds.append(seconds)
+        self._failures.append(failure)
+        self._remedies.append(remedy)
+
+    def finished(self) -> FactorBatch:
+        """Returns the message."""
+        if any(self._failures):
+            self.message.failures.extend(self._failures)
+        if any(self._remedies):
+            self.message.remedies.extend(self._remedies)
+        return self.message

@@ -1,0 +1,74 @@
+# SPDX-License-Identifier: MIT
+"""Several jobs in one message: their matrices one after another in one slot, and rooms for their factors in another."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from protocol.channels import PROTOCOL
+from protocol.messages_pb2 import Header, MatrixBatch
+from protocol.method import Method
+from protocol.shared_memory.pool import Slot
+from protocol.validate import checksum
+from sim_server.network.factor_decoder import AnnouncedObject
+from sim_server.network.leases import InFlightJob
+from sim_server.updates.factor_source import Job
+
+MOST_TOGETHER = 64  # jobs of a message: as many as a worker on a GPU factorizes together
+ALIGNMENT = 64  # bytes to which the room of a factor is rounded up
+
+
+class Entry(NamedTuple):
+    """A job of a batch. room: bytes for its factor, first: of them in the slot"""
+
+    job: Job
+    known: AnnouncedObject
+    room: int
+    first: int
+
+
+def entries_of(jobs: Sequence[tuple[Job, AnnouncedObject]]) -> list[Entry]:
+    """Lays out the rooms of factors that are as large as the largest so far."""
+    made, first = [], 0
+    for job, known in jobs:
+        size = known.largest[job.method.name] * np.dtype(job.dtype).itemsize
+        room = -(-size // ALIGNMENT) * ALIGNMENT
+        made.append(Entry(job, known, room, first))
+        first += room
+    return made
+
+
+def batch_message(
+    entries: Sequence[Entry], in_flight: Sequence[InFlightJob], leases: Sequence[float], incarnation: int,
+    matrix_slot: Slot, factor_slot: Slot,
+) -> MatrixBatch:  # fmt: skip
+    """Copies the matrices into their slot and returns the message of the batch.
+
+    entries, in_flight, leases: of the same jobs; leases: time [s] that the worker has for the answer
+    """
+    first, method = entries[0].job, entries[0].job.method
+    values = matrix_slot.array(np.float64, sum(entry.job.values.size for entry in entries))
+    checksums, begin = [], 0
+    for entry in entries:
+        part = values[begin : begin + entry.job.values.size]
+        np.copyto(part.reshape(entry.job.values.shape), entry.job.values)
+        checksums.append(checksum(part))
+        begin += part.size
+    return MatrixBatch(
+        header=Header(protocol=PROTOCOL, incarnation=incarnation, sequence=in_flight[-1].number),
+        worker=in_flight[0].worker, factor_dtype=first.dtype, method=method.name,
+        drop_tolerance=method.drop_tolerance, fill=method.fill, omega=method.omega,
+        matrix_slot=matrix_slot.message(), factor_slot=factor_slot.message(),
+        objects=[entry.job.object for entry in entries], epochs=[entry.job.epoch for entry in entries],
+        jobs=[job.number for job in in_flight], steps=[entry.job.step for entry in entries],
+        warps=[entry.job.warp for entry in entries], blocks=[entry.known.blocks for entry in entries],
+        checksums=checksums, rooms=[entry.room for entry in entries], leases=leases,
+        known=[len(entry.known.patterns) for entry in entries],
+        known_patterns=[id for entry in entries for id in entry.known.patterns],
+    )  # fmt: skip
+
+
+def group(job: Job) -> tuple[str, Method]:
+    """What the jobs of a batch have in common."""
+    return job.dtype, job.method

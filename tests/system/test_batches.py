@@ -1,0 +1,358 @@
+# SPDX-License-Identifier: MIT
+"""Jobs of many small objects in one message, and their answers: each counts by itself."""
+
+import math
+import os
+import threading
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+from hand_worker import HandWorker
+from link_helpers import DenseAnalysis, Driver, chain, dense, free_endpoint, light_worker, matrix, product
+from zenoh.handlers import RingChannel
+
+from protocol.channels import key
+from protocol.messages_pb2 import FactorBatch, MatrixBatch
+from protocol.shared_memory.limits import obstacle
+from protocol.shared_memory.view import SlotMap
+from protocol.validate import checksum
+from sim_server.network import dispatch
+from sim_server.network.link import ServerLink
+from sim_server.updates.factor_source import Job
+
+pytestmark = [
+    pytest.mark.system,
+    pytest.mark.skipif(bool(obstacle()), reason=f"no shared memory here: {obstacle()}"),
+]
+
+NAMES = ("a", "b", "c", "d")
+BEAMS = {name: chain(6 + k, name) for k, name in enumerate(NAMES)}  # of different sizes
+ANALYSES = {
+    name: DenseAnalysis(np.frombuffer(beam.row_start, np.int32), np.frombuffer(beam.columns, np.int32))
+    for name, beam in BEAMS.items()
+}
+
+
+def jobs(step: int, names: tuple[str, ...] = NAMES, **changes: Any) -> list[Job]:
+    """A matrix of each, another one at each step."""
+    return [Job(n, 1, step, True, matrix(BEAMS[n], shift(n, step)), **changes) for n in names]
+
+
+def shift(name: str, step: int) -> float:
+    return 0.1 * NAMES.index(name) + 0.01 * step
+
+
+class Hand:
+    """A worker played by hand that takes batches."""
+
+    def __init__(self, driver: Driver, hand: HandWorker):
+        self.driver, self.hand, self.slots, self.step = driver, hand, SlotMap(), 0
+        self.received = hand.session.zenoh.declare_subscriber(key("matrices", worker="hand"), RingChannel(64))
+
+    def hello(self, **changes: Any) -> None:
+        self.hand.hello(pid=os.getpid(), **({"most_jobs": 64, "batches": True, "shared_memory": True} | changes))
+
+    def first_factors(self) -> None:
+        """One of each alone, after which their sizes are known."""
+        for name in NAMES:
+            self.driver.submit(BEAMS[name], 0)
+            answer, values = self.hand.right_answer(self.hand.receive(), BEAMS[name])
+            self.hand.answer(answer, values)
+            self.driver.until(lambda name=name: any(f.object == name for f in self.driver.factors), "a first factor")
+
+    def batch(self, names: tuple[str, ...] = NAMES) -> MatrixBatch:
+        """Has the server send one; its matrices are what was given."""
+        self.step += 1
+        self.driver.factors.clear()
+        self.driver.failures.clear()
+        self.driver.until(lambda: self.driver.link.dispatch.ready() >= len(names), "room")
+        assert self.driver.link.dispatch.submit_many(jobs(self.step, names)) == [True] * len(names)
+        sample = self.driver.until(self.received.try_recv, "the batch")
+        batch = MatrixBatch.FromString(bytes(sample.attachment))
+        values = self.slots.array(batch.matrix_slot, np.float64, 9 * sum(batch.blocks))
+        parts = np.split(values, np.cumsum(9 * np.array(batch.blocks))[:-1])
+        for name, part, check in zip(batch.objects, parts, batch.checksums, strict=True):
+            assert np.array_equal(part.reshape(-1, 3, 3), matrix(BEAMS[name], shift(name, self.step)))
+            assert checksum(part) == check
+        return batch
+
+    def answer(self, batch: MatrixBatch, places: list[int] | None = None, edit: Any = None) -> FactorBatch:
+        """What a good worker would answer to jobs at these places, but for what `edit` does to the values."""
+        places = list(range(len(batch.jobs))) if places is None else places
+        rooms = np.cumsum([0, *batch.rooms])
+        message = FactorBatch(header=self.hand.header(), worker="hand", slot=batch.factor_slot, matrix_shared=True)
+        room = self.slots.array(batch.factor_slot, np.uint8, int(rooms[-1]))
+        for place in places:
+            name = batch.objects[place]
+            values = ANALYSES[name].factorize(matrix(BEAMS[name], shift(name, self.step)), np.float32)
+            values = values if edit is None else edit(place, values)
+            room[rooms[place] : rooms[place] + values.nbytes].view(np.float32)[:] = values
+            message.jobs.append(batch.jobs[place])
+            message.patterns.append(ANALYSES[name].pattern.id)
+            message.nonzeros.append(len(values))
+            message.checksums.append(checksum(values))
+            message.seconds.append(1e-4)
+        return message
+
+    def send(self, message: FactorBatch) -> None:
+        self.hand.put("factors", b"", message.SerializeToString(), worker="hand")
+
+    def made(self) -> set[str]:
+        return {factor.object for factor in self.driver.factors}
+
+    def failed(self) -> set[str]:
+        return {name for name, _ in self.driver.failures}
+
+    def check_factors(self) -> None:
+        for factor in self.driver.factors:
+            expected = dense(BEAMS[factor.object], matrix(BEAMS[factor.object], shift(factor.object, self.step)))
+            assert np.allclose(product(factor), expected, atol=1e-5) and factor.step == self.step
+
+
+@pytest.fixture(scope="module")
+def stage() -> Iterator[Hand]:
+    patch = pytest.MonkeyPatch()
+    patch.setattr(dispatch, "QUEUE_SECONDS", 60.0)
+    endpoint = free_endpoint()
+    with (
+        ServerLink(listen=[endpoint], silence=600) as link,
+        HandWorker(endpoint, link.incarnation, shared_memory=True) as hand,
+    ):
+        played = Hand(Driver(link), hand)
+        for beam in BEAMS.values():
+            link.announce(beam)
+        played.hello()
+        played.driver.until(link.dispatch.ready, "the worker")
+        played.first_factors()
+        yield played
+    patch.undo()
+
+
+def all_are_back(hand: Hand) -> bool:
+    return hand.made() | hand.failed() == set(NAMES)
+
+
+def test_a_batch_is_one_message_each_way(stage: Hand) -> None:
+    batch = stage.batch()
+    assert list(batch.objects) == list(NAMES) and list(batch.steps) == [stage.step] * 4 and list(batch.known) == [1] * 4
+    assert stage.driver.link.slots_lent == 2, "one for the matrices, one for the factors"
+    stage.send(stage.answer(batch))
+    stage.driver.until(lambda: all_are_back(stage), "the factors")
+    stage.check_factors()
+    assert stage.made() == set(NAMES) and stage.driver.link.slots_lent == 0
+
+
+def test_answers_may_come_in_parts_and_in_any_order(stage: Hand) -> None:
+    batch = stage.batch()
+    stage.send(stage.answer(batch, [3, 1]))
+    stage.driver.until(lambda: stage.made() == {"b", "d"}, "two of them")
+    assert stage.driver.link.slots_lent == 2, "the others may still write to theirs"
+    stage.send(stage.answer(batch, [2, 0]))
+    stage.driver.until(lambda: all_are_back(stage), "the others")
+    stage.check_factors()
+    assert stage.driver.link.slots_lent == 0
+
+
+def test_an_object_alone_goes_as_ever(stage: Hand) -> None:
+    stage.driver.factors.clear()
+    stage.driver.until(lambda: stage.driver.link.dispatch.submit_many(jobs(900, ("c",))) == [True], "room")
+    job = stage.hand.receive()
+    assert (job.header.object, job.step) == ("c", 900) and stage.received.try_recv() is None
+    answer, values = stage.hand.right_answer(job, BEAMS["c"], shift("c", 900))
+    stage.hand.answer(answer, values)
+    stage.driver.until(lambda: stage.made() == {"c"}, "its factor")
+
+
+def test_types_and_methods_are_not_mixed(stage: Hand) -> None:
+    stage.driver.factors.clear()
+    mixed = [*jobs(901, ("a", "b")), *jobs(901, ("c", "d"), dtype="float64")]
+    stage.driver.until(lambda: stage.driver.link.dispatch.ready() >= 4, "room")
+    assert stage.driver.link.dispatch.submit_many(mixed) == [True] * 4
+    found = [
+        MatrixBatch.FromString(bytes(stage.driver.until(stage.received.try_recv, "a batch").attachment))
+        for _ in range(2)
+    ]
+    assert sorted((b.factor_dtype, *b.objects) for b in found) == [("float32", "a", "b"), ("float64", "c", "d")]
+    for batch in found:
+        stage.send(_failing(stage, batch))
+    stage.driver.until(lambda: stage.failed() == set(NAMES), "the failures")
+
+
+def _failing(stage: Hand, batch: MatrixBatch) -> FactorBatch:
+    count = len(batch.jobs)
+    return FactorBatch(
+        header=stage.hand.header(), worker="hand", slot=batch.factor_slot, jobs=batch.jobs, patterns=[0] * count,
+        nonzeros=[0] * count, checksums=[0] * count, seconds=[0.0] * count, failures=["not today"] * count,
+    )  # fmt: skip
+
+
+Spoil = Callable[[FactorBatch], None]
+
+
+def field(name: str, value: Any) -> Spoil:
+    def spoil(message: FactorBatch) -> None:
+        getattr(message, name)[1] = value
+
+    return spoil
+
+
+# What is wrong with the second of four answers, and how it is refused. Those of the others count.
+ONE: dict[str, tuple[str, Spoil]] = {
+    "checksum": ("checksum", field("checksums", 7)),
+    "pattern never sent": ("pattern", field("patterns", 7)),
+    "size": ("shape", field("nonzeros", 2**62)),
+    "NaN seconds": ("malformed", field("seconds", math.nan)),
+    "negative seconds": ("malformed", field("seconds", -1.0)),
+}
+
+
+@pytest.mark.parametrize("name", ONE)
+def test_what_is_wrong_with_one_costs_the_others_nothing(stage: Hand, name: str) -> None:
+    kind, spoil = ONE[name]
+    batch, before = stage.batch(), stage.driver.link.counters.refusals[kind]
+    message = stage.answer(batch)
+    spoil(message)
+    stage.send(message)
+    stage.driver.until(lambda: all_are_back(stage), "the answers")
+    stage.check_factors()
+    assert stage.made() == {"a", "c", "d"} and stage.failed() == {"b"}
+    assert stage.driver.link.counters.refusals[kind] == before + 1 and stage.driver.link.slots_lent == 0
+
+
+@pytest.mark.parametrize(("value", "kind"), [(math.nan, "not_finite"), (-1.0, "not_positive")])
+def test_bad_values_of_one_cost_the_others_nothing(stage: Hand, value: float, kind: str) -> None:
+    def edit(place: int, values: np.ndarray) -> np.ndarray:
+        if place == 2:
+            values[0] = value
+        return values
+
+    batch, before = stage.batch(), stage.driver.link.counters.refusals[kind]
+    stage.send(stage.answer(batch, edit=edit))
+    stage.driver.until(lambda: all_are_back(stage), "the answers")
+    assert stage.made() == {"a", "b", "d"} and stage.failed() == {"c"}
+    assert stage.driver.link.counters.refusals[kind] == before + 1
+
+
+def test_a_failed_job_is_told_with_its_reason(stage: Hand) -> None:
+    batch = stage.batch()
+    message = stage.answer(batch)
+    message.failures.extend(["", "", "", "not positive definite"])
+    stage.send(message)
+    stage.driver.until(lambda: all_are_back(stage), "the answers")
+    assert stage.made() == {"a", "b", "c"} and "failed: not positive definite" in stage.driver.failures[0][1]
+
+
+def put(name: str, value: Any) -> Spoil:
+    return lambda message: setattr(message, name, value)
+
+
+# Wrong as a whole: nothing of it counts, and the right answers may still come.
+WHOLE: dict[str, tuple[str, Spoil]] = {
+    "a list too short": ("shape", lambda m: m.nonzeros.__delitem__(-1)),
+    "a list too long": ("shape", lambda m: m.seconds.append(0.0)),
+    "one reason for four": ("shape", lambda m: m.failures.append("why")),
+    "no job": ("shape", lambda m: m.ClearField("jobs")),
+    "other worker": ("worker", put("worker", "other")),
+    "other protocol": ("version", lambda m: setattr(m.header, "protocol", 99)),
+    "an earlier life": ("incarnation", lambda m: setattr(m.header, "incarnation", 1)),
+    "too many": ("size", lambda m: m.jobs.extend([1 << 40] * (1 << 17))),
+}
+
+
+@pytest.mark.parametrize("name", WHOLE)
+def test_a_malformed_answer_changes_nothing(stage: Hand, name: str) -> None:
+    kind, spoil = WHOLE[name]
+    batch, before = stage.batch(), stage.driver.link.counters.refusals[kind]
+    message = stage.answer(batch)
+    spoil(message)
+    stage.send(message)
+    stage.driver.until(lambda: stage.driver.link.counters.refusals[kind] == before + 1, "the refusal")
+    assert not stage.driver.factors and not stage.driver.failures
+    stage.send(stage.answer(batch))
+    stage.driver.until(lambda: stage.made() == set(NAMES), "the right ones")
+
+
+def test_answers_of_no_job_and_second_answers_are_refused_one_by_one(stage: Hand) -> None:
+    batch, refusals = stage.batch(), stage.driver.link.counters.refusals
+    before = refusals["sequence"], refusals["duplicate"]
+    message = stage.answer(batch, [0, 0, 1, 2, 3])
+    message.jobs[3] = 10**9
+    stage.send(message)
+    stage.driver.until(lambda: stage.made() == {"a", "b", "d"}, "three of them")
+    assert (refusals["sequence"], refusals["duplicate"]) == (before[0] + 1, before[1] + 1)
+    stage.send(stage.answer(batch, [2]))
+    stage.driver.until(lambda: stage.made() == set(NAMES), "the last one")
+
+
+def test_a_slot_of_another_generation_is_not_read(stage: Hand) -> None:
+    batch = stage.batch()
+    message = stage.answer(batch)
+    message.slot.generation += 1
+    stage.send(message)
+    stage.driver.until(lambda: stage.failed() == set(NAMES), "the refusals")
+    assert not stage.driver.factors and stage.driver.link.slots_lent == 0
+
+
+def test_an_object_whose_mesh_changed_loses_its_own_factor_alone(stage: Hand) -> None:
+    batch, before = stage.batch(), stage.driver.link.counters.refusals["epoch"]
+    stage.driver.link.announce(chain(9, "b", epoch=2))
+    stage.send(stage.answer(batch))
+    stage.driver.until(lambda: all_are_back(stage), "the answers")
+    assert stage.made() == {"a", "c", "d"} and stage.failed() == {"b"}
+    assert stage.driver.link.counters.refusals["epoch"] == before + 1 and stage.driver.link.slots_lent == 0
+    stage.driver.link.announce(BEAMS["b"])
+    stage.first_factors()
+
+
+def test_a_worker_of_an_older_version_gets_them_one_by_one(stage: Hand) -> None:
+    stage.hello(batches=False)
+    info = lambda: [w for w in stage.driver.link.dispatch.workers() if not w.batches]  # noqa: E731
+    stage.driver.until(info, "the hello")
+    assert stage.driver.link.dispatch.submit_many(jobs(902)) == [True] * 4
+    for _ in NAMES:
+        job = stage.hand.receive()
+        answer, values = stage.hand.right_answer(job, BEAMS[job.header.object], shift(job.header.object, 902))
+        stage.hand.answer(answer, values)
+    assert stage.received.try_recv() is None
+    stage.hello()
+    stage.driver.until(lambda: not info(), "the hello")
+
+
+def test_a_real_worker_answers_batches(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Twelve objects of three sizes, forty rounds: each factor is that of its own matrix."""
+    monkeypatch.setattr(dispatch, "QUEUE_SECONDS", 60.0)
+    endpoint, names = free_endpoint(), [f"beam{k}" for k in range(12)]
+    beams = [chain(5 + k % 3, name) for k, name in enumerate(names)]
+    with ServerLink(listen=[endpoint]) as link, light_worker(endpoint):
+        driver, messages = Driver(link), [0]
+        counting = threading.Lock()
+
+        def count(sample: Any) -> None:
+            with counting:
+                messages[0] += 1
+
+        with HandWorker(endpoint, link.incarnation, "listener") as other:
+            listening = other.session.zenoh.declare_subscriber(key("factors", worker="light"), count)
+            for beam in beams:
+                link.announce(beam)
+            for beam in beams:
+                assert driver.factor(beam, 1)
+                driver.factors.clear()
+            for step in range(2, 42):
+                driver.factors.clear()
+                given = [
+                    Job(n, 1, step, True, matrix(b, 0.1 * k + 0.01 * step))
+                    for k, (n, b) in enumerate(zip(names, beams, strict=True))
+                ]
+                driver.until(lambda: link.dispatch.ready() >= len(names), "room")
+                assert all(link.dispatch.submit_many(given))
+                driver.until(lambda: len(driver.factors) == len(names), "all factors")
+                for factor in driver.factors:
+                    k = names.index(factor.object)
+                    expected = dense(beams[k], matrix(beams[k], 0.1 * k + 0.01 * step))
+                    assert np.allclose(product(factor), expected, atol=1e-5) and factor.step == step
+            listening.undeclare()
+        assert 40 <= messages[0] <= 40 * len(names) and driver.failures == [] and link.counters.refused == 0
+        assert link.slots_lent == 0 and link.counters.bulk_shared >= 2 * 40 * len(names)
