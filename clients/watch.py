@@ -16,7 +16,7 @@ from rich.table import Table
 from rich.text import Text
 
 from clients.client import Client
-from clients.log.scalars import enum_name, reaction_name, status_name
+from clients.log.scalars import ended, enum_name, reaction_name
 from protocol import messages_pb2 as pb
 
 PERIOD = 0.5  # s between two readings
@@ -54,7 +54,7 @@ def _summary(status: pb.Status) -> Text:
         f"step {status.step}, t = {status.time:.3f} s, dt = {status.dt * 1e3:g} ms",
         f"step p50 {_ms(status.step_p50)}, p99 {_ms(status.step_p99)}, max {_ms(status.step_max)}, "
         f"late {status.late_steps}; dropped: frames {status.frames_dropped}, step records {status.records_dropped}; "
-        f"lost to the log {status.records_lost}",
+        f"lost to the log {status.records_lost}, left out of it {status.records_thinned}",
         f"refused: messages {status.refused}, commands {status.commands_refused}; "
         f"arrays through shared memory {status.bulk_shared}, "
         f"as bytes {status.bulk_copied}; clients {len(status.clients)}",
@@ -95,7 +95,7 @@ def places(status: pb.Status) -> Table | Text:
 
 def _status(found: pb.ObjectStatus) -> Text:
     away = found.last.status == pb.RUNAWAY
-    return Text("RUNAWAY", style="bold red") if away else Text(status_name(found.last.status))
+    return Text("RUNAWAY", style="bold red") if away else Text(ended(found.last))
 
 
 def _events(status: pb.Status) -> list[Table]:

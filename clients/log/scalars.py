@@ -16,7 +16,7 @@ from protocol import messages_pb2 as pb
 Columns = dict[str, NDArray]
 V = TypeVar("V")
 
-INPUTS = ("asked", "probe")  # of a solve: for replays only
+INPUTS = ("asked", "probe", "left_out")  # for replays only
 REACTION = "reaction/"  # columns reaction/WHAT/force_x to torque_z [N, N m] and point_z [m]
 REACTIONS = ("force_x", "force_y", "force_z", "torque_x", "torque_y", "torque_z", "point_x", "point_y", "point_z")
 """Of what the object exerts on WHAT (`reaction_name`); the point only where the torque is about one of its own."""
@@ -45,6 +45,11 @@ ENUMS = {f.name: {v.number: v.name.lower() for v in f.enum_type.values} for f in
 def status_name(value: int) -> str:
     """Names a SolveStatus, e.g. 'converged' or 'max_iterations'; 'unknown_7' if this version does not know it."""
     return enum_name("status", value)
+
+
+def ended(step: pb.ObjectStep) -> str:
+    """Says how the solve of a step ended: the name of its status, or that the object is at rest."""
+    return "at rest" if step.at_rest and step.status == pb.CONVERGED else status_name(step.status)
 
 
 def enum_name(field: str, value: int) -> str:
