@@ -183,7 +183,7 @@ class Dispatch(FactorSource):
         """Objects whose job was taken from a slow worker since another one is idle; they may be submitted again."""
         with self._lock:
             slow = self.leases.reassign(
-                self._clock(), lambda job: not self._is_decoded(job) and self._has_candidates(job)
+                self._clock(), lambda job: not self._is_arriving(job) and self._has_candidates(job)
             )
             self._counters.add("passed_on", len(slow))
             return [job.object for job in slow]
@@ -633,11 +633,18 @@ class Dispatch(FactorSource):
         """True while the answer to a job is taken in beside the caller."""
         return any(each.job.number == job.number for each in self._decoding)
 
+    def _is_arriving(self, job: InFlightJob) -> bool:
+        """True while the answer to a job is taken in, unless it comes in parts and none comes any more."""
+        return any(
+            each.job.number == job.number and not (each.fetch is not None and each.fetch.stalls)
+            for each in self._decoding
+        )
+
     def _take_decoded(self) -> None:
         """Takes the large factors that were decoded beside the caller, unless their jobs are over."""
         for each in self._decoding:
             if each.fetch is not None and self.leases.by_object.get(each.job.object) is not each.job:
-                each.fetch.gone.set()
+                each.fetch.give_up()
         done = [each for each in self._decoding if each.factor.done()]
         for each in done:
             self._decoding.remove(each)
@@ -652,17 +659,16 @@ class Dispatch(FactorSource):
                 if self.leases.is_reassigned(current):
                     self.leases.finish(current, message.seconds)
                 else:
-                    by_slot = (
-                        message.matrix_shared,
-                        bool(fetch.slots if fetch is not None else message.HasField("slot")),
-                    )
-                    self._take_factor(current, factor.result, message.failure, message.seconds, by_slot)
+                    told = message.failure, message.seconds, _slots_used(message, fetch)
+                    self._take_factor(current, factor.result, *told)
             except Refused as refusal:
                 self._counters.refuse(refusal)
 
     def _end_gone(self, job: InFlightJob) -> None:
         """Frees the worker of a job that is over, if it is still there."""
         if self.leases.by_worker.get(job.worker, {}).get(job.number) is job:
+            if self.leases.is_reassigned(job):  # its parts did not come
+                self._reliability.on_failure(job.worker, job.object, self._clock())
             self.leases.finish(job)
 
     def _take_factor(
@@ -714,6 +720,6 @@ class Dispatch(FactorSource):
         self._failures.append((job.object, f"factorization of {job.object} at step {job.step} {why}"))
 
 
-def _slots_used(message: FactorMessage) -> tuple[bool, bool]:
-    """Whether matrix and factor travelled in shared memory."""
-    return message.matrix_shared, message.HasField("slot")
+def _slots_used(message: FactorMessage, fetch: FactorFetch | None = None) -> tuple[bool, bool]:
+    """Whether matrix and factor travelled in shared memory. fetch: of its parts"""
+    return message.matrix_shared, message.HasField("slot") or (fetch is not None and bool(fetch.slots))

@@ -14,8 +14,8 @@ from hand_worker import HandWorker
 from link_helpers import Driver, chain, dense, free_endpoint, light_worker, matrix, product
 
 from protocol.channels import PROTOCOL, key
-from protocol.factor_parts import bytes_of, part, part_checksums
 from protocol.messages_pb2 import Factor, FactorPart, Header, Matrix
+from protocol.network.factor_parts import bytes_of, part, part_checksums
 from protocol.network.session import open_session
 from protocol.shared_memory import limits as shm_limits
 from sim_server.network import dispatch, factor_fetch
@@ -141,6 +141,29 @@ def test_a_large_factor_holds_up_no_other_object(monkeypatch: pytest.MonkeyPatch
         gate.open.set()
         driver.until(lambda: len(driver.factors) == 2, "the other one")
         assert is_right(driver.factors[1]) and driver.failures == []
+
+
+def test_who_announces_and_sends_nothing_is_passed_over(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Another worker has the job once no part has come for a while, and the questions that wait end at once."""
+    monkeypatch.setattr(factor_fetch, "STALL", 0.2)
+    monkeypatch.setattr(factor_fetch, "QUESTION_TIME", 1000.0)
+    endpoint = free_endpoint()
+    with ServerLink(listen=[endpoint], silence=60) as link, PartsByHand(endpoint, link.incarnation) as hand:
+        driver, held = Driver(link), list[Any]()  # questions that are never answered
+        link.announce(BEAM)
+        hand.hello()
+        driver.submit(BEAM, 1)
+        answer, _ = hand.announcement(hand.receive())
+        hand.session.zenoh.declare_queryable(key("part", worker="hand"), held.append)
+        hand.answer(answer)
+        driver.until(lambda: held, "a question")
+        with light_worker(endpoint):
+            driver.until(lambda: len(link.dispatch.workers()) == 2, "the other worker")
+            driver.until(lambda: link.dispatch.reassigned() == ["beam"], "the job to be free")
+            driver.until(lambda: not link.dispatch._decoding, "the end of the fetch")
+            assert link.dispatch._reliability.failing_objects == {"beam"}, "it is held against who sent nothing"
+            hand.close()
+            assert is_right(driver.factor(BEAM, 2)) and driver.factors[0].worker == "light"
 
 
 def test_a_split_drops_what_is_under_way(monkeypatch: pytest.MonkeyPatch) -> None:
