@@ -32,11 +32,11 @@ def later_pieces(path: Path) -> list[tuple[int, Path]]:
 
 def size_of_log(path: Path) -> int:
     """Bytes of all pieces of a log [bytes]; 0 if there is none."""
-    return sum(_bytes(piece) for piece in [path, *(piece for _, piece in later_pieces(path))])
+    return sum(size_of_file(piece) for piece in [path, *(piece for _, piece in later_pieces(path))])
 
 
-def _bytes(piece: Path) -> int:
-    """Bytes of a piece; 0 if it is none, or was removed meanwhile to keep a budget."""
+def size_of_file(piece: Path) -> int:
+    """Bytes of a piece [bytes]; 0 if it is no file, or was removed meanwhile to keep a budget."""
     try:
         found = piece.stat()
     except OSError:

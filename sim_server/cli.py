@@ -7,7 +7,7 @@ import sys
 import time
 from collections.abc import Callable
 from contextlib import ExitStack, nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -97,7 +97,10 @@ def serve(
     realtime: Annotated[
         bool, typer.Option("--realtime/--free-run", help="Keep pace with the clock, or as fast as it goes")
     ] = True,
-    record: Annotated[Path | None, typer.Option(metavar="FILE.mcap", help="Write a log (replaces the file)")] = None,
+    record: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE.mcap", help="Write a log (replaces the file); {time} in its name: of the start"),
+    ] = None,
     record_rotate: Annotated[
         list[str] | None,
         typer.Option(metavar="SIZE|TIME", help="Go on in a new file after so much, as 500MB or 1h; may be repeated"),
@@ -203,7 +206,7 @@ def serve(
         print(f"sim-server: {error}", file=sys.stderr)
         code = 1
     if service is not None and service.recorder is not None and service.recorder.failure:
-        print(f"sim-server: exit code 1: the log {record} is not whole", file=sys.stderr)
+        print(f"sim-server: exit code 1: the log {service.recorder.path} is not whole", file=sys.stderr)
         code = 1
     raise typer.Exit(code)
 
@@ -285,6 +288,7 @@ def _set_up(closing: ExitStack, o: Options) -> "tuple[Service, Supervisor | None
     from sim_server.network.link import ServerLink
     from sim_server.recording.recorder import Recorder
     from sim_server.recording.rotation import Rotation
+    from sim_server.recording.starts import earlier, started
     from sim_server.scene.size_limits import SizeLimits
     from sim_server.service.service import Service
     from sim_server.service.supervisor import Supervisor
@@ -310,10 +314,11 @@ def _set_up(closing: ExitStack, o: Options) -> "tuple[Service, Supervisor | None
         )
         recorder = None
         if o.record is not None:
-            _check_log_path(o.record)
+            path, rotation = started(o.record), replace(rotation, earlier=tuple(earlier(o.record)))
+            _check_log_path(path)
             compression = simulation.scene.record.compression
             recorder = closing.enter_context(
-                Recorder(o.record, compression, overwrite=True, report=logging.error, rotation=rotation)
+                Recorder(path, compression, overwrite=True, report=logging.error, rotation=rotation)
             )
         try:
             service = Service(simulation, link, recorder, o.steps, o.realtime, checkpoint)

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from protocol.log_pieces import later_pieces
+from protocol.log_pieces import later_pieces, size_of_file
 from sim_server.errors import InputError
 from sim_server.scene.sizes import SIZES, TIMES, measure
 
@@ -18,11 +18,15 @@ LEAST_BYTES, LEAST_SECONDS = 10**6, 1.0
 
 @dataclass(frozen=True)
 class Rotation:
-    """bytes, seconds: after which a new file is begun. keep: bytes of all files together. None: no limit"""
+    """bytes, seconds: after which a new file is begun. keep: bytes of all files together. None: no limit
+
+    earlier: files of earlier logs that count to `keep`, oldest first
+    """
 
     bytes: float | None = None
     seconds: float | None = None
     keep: float | None = None
+    earlier: tuple[Path, ...] = ()
 
     @classmethod
     def of_options(cls, rotate: Sequence[str], keep: str | None) -> Rotation:
@@ -54,11 +58,12 @@ class Rotation:
 
 
 class Kept:
-    """The files of a log that were ended, oldest first; removes the oldest of them to keep the budget."""
+    """The files that were ended, those of earlier logs first; removes the oldest of them to keep the budget."""
 
     def __init__(self, rotation: Rotation):
         self._rotation = rotation
-        self._ended: deque[tuple[Path, int]] = deque()
+        ours = (path for path in rotation.earlier if _is_log(path))
+        self._ended: deque[tuple[Path, int]] = deque((path, size_of_file(path)) for path in ours)
         self.removed = 0
 
     def add(self, path: Path, size: int) -> None:
@@ -79,8 +84,15 @@ class Kept:
 def remove_earlier(path: Path) -> None:
     """Removes later pieces of an earlier log of this name, which is to be replaced. Other files are left alone."""
     for _, piece in later_pieces(path):
-        with contextlib.suppress(OSError):
-            with piece.open("rb") as file:
-                ours = file.read(8) in (b"\x89MCAP0\r\n", b"")
-            if ours:
+        if _is_log(piece):
+            with contextlib.suppress(OSError):
                 piece.unlink()
+
+
+def _is_log(path: Path) -> bool:
+    """True of a file that is empty or begins as a log does."""
+    try:
+        with path.open("rb") as file:
+            return file.read(8) in (b"\x89MCAP0\r\n", b"")
+    except OSError:
+        return False

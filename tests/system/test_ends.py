@@ -9,9 +9,10 @@ from pathlib import Path
 import pytest
 
 from clients.log.reader import Log
+from sim_server.recording.starts import earlier, started
 from tests.sample_run import record
 from tests.system.link_helpers import PATIENCE, ROOT, free_endpoint
-from tests.system.server_process import Stage, beam, fresh, until
+from tests.system.server_process import Stage, beam, fresh, run, until
 
 pytestmark = pytest.mark.system
 FOLDER = Path(__file__).parent
@@ -104,3 +105,24 @@ def test_a_picture_file_on_a_full_disk_is_one_line(tmp_path: Path) -> None:
         assert done.returncode == 1
         assert done.stderr == f"sim-client: {tmp_path / 'x.rrd'}: cannot be written: File too large\n"
         assert sorted(p.name for p in tmp_path.iterdir()) == ["run.mcap"]
+
+
+def test_a_server_that_is_started_again_keeps_its_log(tmp_path: Path) -> None:
+    template = tmp_path / "run-{time}.mcap"
+    options = ["--free-run", "--steps", "2", "--record-rotate", "1MB", "--record-keep", "10MB"]
+    for starts in (1, 2):
+        server = run(
+            "sim_server",
+            str(beam(tmp_path, (1, 1, 2))),
+            "--listen",
+            free_endpoint(),
+            "--record",
+            str(template),
+            *options,
+        )
+        assert server.returncode == 0, server.stderr
+        logs = earlier(template)
+        assert len(logs) == starts and not template.exists()
+        with Log(logs[-1]) as log:
+            assert log.complete
+        logs[-1].rename(started(template, 60 * starts))  # two starts within a second would be one
