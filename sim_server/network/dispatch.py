@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import partial
+from typing import Any, NamedTuple
 
 import numpy as np
 import zenoh
@@ -44,6 +45,21 @@ LARGE = 4 << 20  # bytes of a factor whose copy and checks take more than a few 
 SLOT_MARGIN = 8  # the slot for an incomplete factor is larger than the largest factor so far by a SLOT_MARGIN-th
 
 
+class Decoding(NamedTuple):
+    """A factor that is decoded beside the caller.
+
+    future: it is decoded once that is done, and `take` returns the factor, or raises Refused
+    seconds, by_slot, duration: as of Dispatch._take_factor
+    """
+
+    job: InFlightJob
+    future: Future[Any]
+    take: Callable[[], Factor]
+    seconds: float
+    by_slot: tuple[bool, bool]
+    duration: float | None = None
+
+
 class Dispatch(FactorSource):
     """The remote workers of a server as a source of factors.
 
@@ -78,7 +94,7 @@ class Dispatch(FactorSource):
         self._answered_at: dict[str, float] = {}  # likewise, of the answers with a factor
         self._fast_links: set[str] = set()  # workers without shared memory whose link takes a job at once
         self._thread = ThreadPoolExecutor(1, "large factors")
-        self._decoding: list[tuple[FactorMessage, InFlightJob, Future[Factor]]] = []
+        self._decoding: list[Decoding] = []
         self._factors: list[Factor] = []
         self._failures: list[tuple[str, str]] = []
         self._patterns: list[tuple[str, FactorPattern]] = []
@@ -219,10 +235,11 @@ class Dispatch(FactorSource):
         taken = [False] * len(jobs)
         batches: dict[tuple[str, tuple[str, Method]], list[int]] = {}  # places of jobs by worker and what they share
         rooms = {name: self._room(name) for name in self._open()} if len(jobs) > 1 else {}
+        able = {name for name in rooms if self._takes_batches(name)}
         for place, job in enumerate(jobs):
             idle = [name for name, room in rooms.items() if room > 0]
             worker = self._worker_for(job, idle, rooms) if idle else None
-            if worker is None or not self._may_batch(job, worker):
+            if worker is None or worker not in able or not self._fits_batch(job):
                 taken[place] = self._submit(job)
                 rooms = {name: self._room(name) for name in self._open()}
                 for (name, _), places in batches.items():
@@ -247,19 +264,16 @@ class Dispatch(FactorSource):
             able = self._candidates(able, self._available(), job.object)
         return self._choose(able, job.object, rooms) if able else None
 
-    def _may_batch(self, job: Job, worker: str) -> bool:
-        """True if a job of the worker may share a message with others: its object is small, and the size of its factor
-        is known."""
+    def _fits_batch(self, job: Job) -> bool:
+        """True if the size of the factor is known: that of an incomplete one may grow."""
+        known = self.decoder.objects[job.object].largest
+        return not job.positions and job.method.name in known and job.method.name != "incomplete_cholesky"
+
+    def _takes_batches(self, worker: str) -> bool:
+        """True if several jobs of a worker may share a message. It has room for several only where all objects are
+        small."""
         info = self._registry.info(worker)
-        return (
-            not job.positions
-            and job.method.name in self.decoder.objects[job.object].largest
-            and job.method.name != "incomplete_cholesky"  # the next factor may be larger
-            and info is not None
-            and info.batches
-            and self._room(worker) > 1
-            and self._has_slots(worker)
-        )
+        return info is not None and info.batches and self._room(worker) > 1 and self._has_slots(worker)
 
     def _send_batch(self, worker: str, jobs: Sequence[Job]) -> list[bool]:
         """Sends jobs to a worker in one message, or one by one if there are no slots for them together."""
@@ -346,7 +360,7 @@ class Dispatch(FactorSource):
             job.warp,
             np.dtype(job.dtype).name,
             worker,
-            deadline=now + lease,
+            deadline=max(now + lease, self.leases.deadlines().get(worker, 0.0)),  # it may wait behind a first job
             factor_slot=factor_slot,
             factor_generation=factor_slot.generation if factor_slot else 0,
             slots=slots,
@@ -549,7 +563,8 @@ class Dispatch(FactorSource):
         if not message.failure and 4 * message.nonzeros > LARGE:  # its bytes are copied and checked beside the caller
             if self._is_decoded(job):
                 raise Refused(f"Factor.job is {job.number}, already answered", "duplicate")
-            self._decoding.append((message, job, self._thread.submit(decode)))
+            future = self._thread.submit(decode)
+            self._decoding.append(Decoding(job, future, future.result, message.seconds, _slots_used(message)))
             return
         self._take_factor(job, decode, message.failure, message.seconds, _slots_used(message))
 
@@ -558,41 +573,52 @@ class Dispatch(FactorSource):
         message = self.decoder.parse_batch(sample.key_expr, sample.attachment)
         now, worker = self._clock(), message.worker
         self._registry.mark_seen(worker, now)
-        duration: float | None = None
+        duration, large = 0.0, 4 * sum(message.nonzeros) > LARGE
+        beside: list[tuple[int, InFlightJob]] = []  # large all together: decoded beside the caller
         for place, number in enumerate(message.jobs):
             try:
                 job = self.leases.match_answer(number, worker, None)
-                failure = message.failures[place] if message.failures else ""
-                if duration is None:
+                if not duration:
                     duration = self._duration(job, now) / len(message.jobs)
                     self._free_since[worker] = now
                     self._reliability.on_answer(worker)
                 if self.leases.is_reassigned(job):
-                    self.leases.finish(job, None if failure else message.seconds[place])
-                    continue
-                decode = partial(self.decoder.decode_one, message, place, job)
-                by_slot = message.matrix_shared, True
-                self._take_factor(job, decode, failure, message.seconds[place], by_slot, duration)
+                    self.leases.finish(job)
+                elif failure := message.failures[place] if message.failures else "":
+                    self._take_factor(job, _no_factor, failure, 0.0, (True, True))
+                elif not large:
+                    decode, told = partial(self.decoder.decode_one, message, place, job), message.seconds[place]
+                    self._take_factor(job, decode, "", told, (message.matrix_shared, True), duration)
+                elif self._is_decoded(job) or any(other is job for _, other in beside):
+                    raise Refused(f"FactorBatch.jobs has {number}, already answered", "duplicate")
+                else:
+                    beside.append((place, job))
             except Refused as refusal:
                 self._counters.refuse(refusal)
+        if beside:
+            future = self._thread.submit(self.decoder.decode_several, message, beside)
+            for k, (place, job) in enumerate(beside):
+                take, by_slot = partial(_result, future, k), (message.matrix_shared, True)
+                self._decoding.append(Decoding(job, future, take, message.seconds[place], by_slot, duration))
 
     def _is_decoded(self, job: InFlightJob) -> bool:
         """True while the answer to a job is decoded beside the caller."""
-        return any(other.number == job.number for _, other, _ in self._decoding)
+        return any(each.job.number == job.number for each in self._decoding)
 
     def _take_decoded(self) -> None:
         """Takes the large factors that were decoded beside the caller, unless their jobs are over."""
-        done = [each for each in self._decoding if each[2].done()]
+        done = [each for each in self._decoding if each.future.done()]
+        if not done:
+            return
+        self._decoding = [each for each in self._decoding if not each.future.done()]
         for each in done:
-            self._decoding.remove(each)
-            message, job, factor = each
+            job = each.job
             try:
                 current = self.leases.match_answer(job.number, job.worker, job.epoch)
                 if self.leases.is_reassigned(current):
-                    self.leases.finish(current, message.seconds)
+                    self.leases.finish(current)
                 else:
-                    told = message.failure, message.seconds, _slots_used(message)
-                    self._take_factor(current, factor.result, *told)
+                    self._take_factor(current, each.take, "", each.seconds, each.by_slot, each.duration)
             except Refused as refusal:
                 self._counters.refuse(refusal)
 
@@ -643,6 +669,19 @@ class Dispatch(FactorSource):
 
     def _fail(self, job: InFlightJob, why: str) -> None:
         self._failures.append((job.object, f"factorization of {job.object} at step {job.step} {why}"))
+
+
+def _no_factor() -> Factor:
+    """Raises Refused: the worker has told why there is none."""
+    raise Refused("there is no factor", "malformed")
+
+
+def _result(future: Future[list[Factor | Refused]], place: int) -> Factor:
+    """Returns one of several factors that were decoded together; raises Refused."""
+    found = future.result()[place]
+    if isinstance(found, Refused):
+        raise found
+    return found
 
 
 def _slots_used(message: FactorMessage) -> tuple[bool, bool]:

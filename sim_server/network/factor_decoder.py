@@ -2,6 +2,7 @@
 """Checks and decodes what workers send: patterns of L, and factors as bytes or in a slot of shared memory."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -135,6 +136,18 @@ class FactorDecoder:
         values = _from_slot(message.slot, nonzeros, job)
         remedy = message.remedies[place] if message.remedies else ""
         return self._factor(pattern, values, message.checksums[place], job, seconds, remedy)
+
+    def decode_several(
+        self, message: FactorBatch, answers: Sequence[tuple[int, InFlightJob]]
+    ) -> list[Factor | Refused]:  # fmt: skip
+        """Returns the factors at some places of a message, or why one is refused. From any thread."""
+        made: list[Factor | Refused] = []
+        for place, job in answers:
+            try:
+                made.append(self.decode_one(message, place, job))
+            except Refused as refusal:
+                made.append(refusal)
+        return made
 
     def _factor(
         self, pattern: FactorPattern, values: Float32 | Float64, checksum: int, job: InFlightJob, seconds: float,
