@@ -420,7 +420,7 @@ def _command(verb: str, connect: Connect, server: str, as_json: bool) -> None:
     from clients.client import Client
 
     with Client(server, connect) as client:
-        reply = client.command(verb)
+        reply = client.pause() if verb == "pause" else client.command(verb)
     _print_outcome(verb, reply, as_json)
 
 
@@ -439,9 +439,9 @@ def _print_outcome(verb: str, reply: pb.Reply, as_json: bool) -> None:
         "reset": "put back at",
         "save": "saved at",
     }[verb]
-    if verb == "step" and found.state != "paused":
+    if verb in ("pause", "step") and found.state != "paused":
         said = f"{found.state} at"
-    if reply.unchanged:
+    elif reply.unchanged:
         said = {"pause": "already paused, at", "resume": "already running, at"}[verb]
     steps = f"{found.step} step{'s' * (found.step != 1)}" if verb == "stop" else f"step {found.step}"
     print(f"{said} {steps} (t = {found.time:.3f} s)")
@@ -866,6 +866,10 @@ def replay(
     listen: Annotated[
         list[str] | None, typer.Option(metavar="ENDPOINT", help=f"Where to be reached, {DEFAULT_ENDPOINT} by default.")
     ] = None,
+    tls: Annotated[
+        str | None,
+        typer.Option("--tls", metavar="DIR", help="Folder of the certificate of a server, beside the others."),
+    ] = None,
     insecure: Annotated[bool, typer.Option("--insecure", help="Let everybody in, also from other machines.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="For programs.")] = False,
 ) -> None:
@@ -878,14 +882,15 @@ def replay(
       sim-client replay run.mcap --loop          and elsewhere: sim-client view --live
       sim-client replay run.mcap --speed 0.5 --from 2 --to 4
       sim-client replay run.mcap --name old --connect tcp/127.0.0.1:7447
+      sim-client replay run.mcap --tls certs --listen tls/0.0.0.0:7447
       sim-client replay run.mcap --simulate
     """
     from clients.replay import command as replay_command
 
     if not simulate:
-        replay_command.republish(log, speed, loop, begin, end, name, connect, listen, as_json, insecure)
+        replay_command.republish(log, speed, loop, begin, end, name, connect, listen, as_json, insecure, tls)
         return
-    if speed != "1" or loop or begin or end is not None or name or connect or listen or insecure:
+    if speed != "1" or loop or begin or end is not None or name or connect or listen or tls or insecure:
         raise BadInput("replay: --simulate takes no other options than --json")
     raise typer.Exit(replay_command.simulate(log, as_json))
 

@@ -7,6 +7,7 @@ import contextlib
 import itertools
 import json
 import math
+import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
@@ -233,8 +234,16 @@ class Client:
         return list(self.command("parameters").parameters)
 
     def pause(self) -> pb.Reply:
-        """Pauses the simulation. The reply comes after the present step; its status has the number of that step."""
-        return self.command("pause")
+        """Pauses the simulation. Returns after the present step; the status of the reply has the number of that step.
+
+        Returns after a minute if that step takes longer: the status then says "running".
+        """
+        reply, end = self.command("pause"), time.monotonic() + LONGEST_STEPS
+        unchanged = reply.unchanged
+        while reply.status.state == "running" and time.monotonic() < end:  # a server answers within a second or so
+            reply = self.command("pause")
+        reply.unchanged = unchanged
+        return reply
 
     def resume(self) -> pb.Reply:
         """Resumes the simulation; the status of the reply has the step."""

@@ -18,7 +18,11 @@ class OutOfRange(NotPositiveDefinite):
 
 
 class NameTaken(RuntimeError):
-    """Another worker of this name serves the server."""
+    """Another worker of this name serves the server. server: its name"""
+
+    def __init__(self, text: str, server: str):
+        super().__init__(text)
+        self.server = server
 
 
 class DeviceUnusable(RuntimeError):

@@ -319,6 +319,8 @@ class Worker:
             if not self._into_slot(message, answer, values):
                 payload = values.tobytes()
         connection.send_factor(answer, payload)
+        if values is not None:
+            self._counters.add("factors")
 
     def _answer_together(
         self, job: Job, batch: Batch, pattern: FactorPattern | None, values: NDArray[Any] | None, seconds: float,

@@ -280,7 +280,7 @@ def _set_up(closing: ExitStack, o: Options) -> "tuple[Service, Supervisor | None
     from protocol.network.metrics_server import metrics_address
     from protocol.network.session import AddressInUse, ConnectionFailed
     from protocol.refused import Refused
-    from sim_server.backends.compiler import CompileError
+    from sim_server.backends.compiler import CompileError, ahead
     from sim_server.checkpoint.file import read
     from sim_server.network.link import ServerLink
     from sim_server.recording.recorder import Recorder
@@ -303,6 +303,7 @@ def _set_up(closing: ExitStack, o: Options) -> "tuple[Service, Supervisor | None
         metrics = None if o.metrics is None else metrics_address(o.metrics)
         checkpoint = None if o.resume is None else read(o.resume)
         limits = SizeLimits.of_options(o.max_objects, o.max_memory)
+        ahead("recording/wire.cpp")
         simulation = Simulation.load(o.scene, o.overrides, o.device, limits)
         link = closing.enter_context(
             ServerLink(o.name, o.listen, o.connect, shared_memory=o.shared_memory, tls=certificates.server)

@@ -24,6 +24,7 @@ from protocol.process.own_python import own_module
 def republish(
     log: Path, speed: str, loop: bool, begin: float, end: float | None, name: str | None,
     connect: Sequence[str] | None, listen: Sequence[str] | None, as_json: bool, insecure: bool = False,
+    tls: str | None = None,
 ) -> None:  # fmt: skip
     """Publishes the log under the name of a server; prints what it does (as_json: a summary at the end, as JSON)."""
     rate = speed_of(speed)
@@ -35,7 +36,7 @@ def republish(
     with timeline:
         for note in timeline.notes:
             print(f"sim-client: {printable(note)}", file=sys.stderr)
-        with ReplayServer(name, timeline.scene.server or SERVER_NAME, connect, listen, insecure) as server:
+        with ReplayServer(name, timeline.scene.server or SERVER_NAME, connect, listen, insecure, tls) as server:
             replay = Player(timeline, server, rate, begin, last)
             if not as_json:
                 print(

@@ -6,16 +6,19 @@ from __future__ import annotations
 import logging
 import secrets
 from collections import Counter, deque
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, Self
 
 import zenoh
 
 from clients.errors import BadInput, ClientError
 from protocol import messages_pb2 as pb
+from protocol.access.rights import Rights
 from protocol.channels import CHANNELS, PROTOCOL, check_name, commands, everything, key
+from protocol.network.access_rules import access_rules
 from protocol.network.endpoints import BadEndpoint, default_endpoint
 from protocol.network.exposure import check_exposure
+from protocol.network.identity import SERVER, Identity, identity_of, roles_of
 from protocol.network.session import ConnectionFailed, Session, open_session
 from protocol.refused import Refused
 from protocol.validate import check_header, parse
@@ -31,12 +34,13 @@ class ReplayServer:
 
     name: raises ClientError if it is taken; None: `otherwise`, with a suffix if that is taken. connect: endpoints of a
     router to join; listen: endpoints to listen on. Without both it listens on the default port, or joins the server
-    that does. insecure: other machines may reach it, though nothing keeps anybody out
+    that does. insecure: other machines may reach it, though nothing keeps anybody out. tls: folder of the certificate
+    of a server; roles of others are read beside it
     """
 
     def __init__(
         self, name: str | None, otherwise: str, connect: Sequence[str] | None, listen: Sequence[str] | None,
-        insecure: bool = False,
+        insecure: bool = False, tls: str | None = None,
     ) -> None:  # fmt: skip
         self.incarnation = secrets.randbits(63) | 1
         self._sequence: Counter[str] = Counter()
@@ -44,13 +48,18 @@ class ReplayServer:
         self._commands: deque[zenoh.Query] = deque()
         try:
             wanted = check_name(otherwise if name is None else name, "server name")
+            identity = None if tls is None else _certificate(tls)
             if not insecure:
-                check_exposure(listen or [], [])
-            self._session, self.where = _joined(connect, listen)
+                check_exposure(listen or [], [], identity is not None)
+            names = _names(wanted, name is not None)
+            roles = None if identity is None else roles_of(identity)
+            self._rights = Rights(roles)
+            rules = None if roles is None else access_rules(names, roles)
+            self._session, self.where = _joined(connect, listen, identity, rules)
         except (Refused, BadEndpoint) as error:
             raise BadInput(str(error)) from None
         try:
-            self.name = self._free(wanted, name is not None)
+            self.name = self._free(names)
             self._zenoh = self._session.zenoh
             self._queryable = self._zenoh.declare_queryable(everything(self.name), self._serve)
             self._token = self._zenoh.liveliness().declare_token(
@@ -79,7 +88,13 @@ class ReplayServer:
             try:
                 command = parse(pb.Command, query.payload, CHANNELS["command"].limit)
                 check_header(command)
-                found.append((command.verb, query))
+                if str(query.key_expr) != f"{commands(self.name)}{command.verb}/{command.client}":
+                    raise Refused("a Command came under the key of another; allowed: its own", "key")
+                self._rights.check(command)
+                if command.verb == "rights":
+                    self.answer(query, self._rights.of(command.client))
+                else:
+                    found.append((command.verb, query))
             except Refused as error:
                 self.answer(query, pb.Reply(error=str(error)))
         return found
@@ -111,12 +126,12 @@ class ReplayServer:
         message.header.protocol, message.header.incarnation = PROTOCOL, self.incarnation
         message.header.sequence = self._sequence[channel]
 
-    def _free(self, wanted: str, asked: bool) -> str:
-        names = [wanted, f"{wanted}-replay", *(f"{wanted}-replay-{k}" for k in range(2, 10))]
-        for name in names[:1] if asked else names:
-            if len(name) <= 64 and not self._taken(name):
+    def _free(self, names: Sequence[str]) -> str:
+        for name in names:
+            if not self._taken(name):
                 return name
-        which = f"a live server {wanted!r} is" if asked else f"live servers {wanted!r}, {names[1]!r} and more are"
+        several = f"live servers {names[0]!r}, {names[-1]!r} and more are"
+        which = several if len(names) > 1 else f"a live server {names[0]!r} is"
         raise ClientError(f"{which} at {self.where}: --name gives the replay another name")
 
     def _taken(self, name: str) -> bool:
@@ -136,17 +151,42 @@ class ReplayServer:
                     query.reply(name, data)
 
 
-def _joined(connect: Sequence[str] | None, listen: Sequence[str] | None) -> tuple[Session, str]:
+def _names(wanted: str, asked: bool) -> list[str]:
+    """Returns the names that it may take."""
+    names = [wanted, f"{wanted}-replay", *(f"{wanted}-replay-{k}" for k in range(2, 10))]
+    return names[:1] if asked else [name for name in names if len(name) <= 64]
+
+
+def _certificate(folder: str) -> Identity:
+    """Returns the certificate of a server in a folder. Raises Refused."""
+    identity = identity_of(folder, (SERVER,))
+    if identity.role != SERVER:
+        text = f"--tls {folder}: this certificate is that of a {identity.role}; a replay shows that of a server"
+        raise Refused(text, "malformed")
+    return identity
+
+
+def _joined(
+    connect: Sequence[str] | None, listen: Sequence[str] | None, tls: Identity | None,
+    access: Mapping[str, Any] | None,
+) -> tuple[Session, str]:  # fmt: skip
     """Returns a session and its endpoints: it listens itself, or joins the server that does."""
+    usual = default_endpoint(tls is not None)
+
+    def joined(endpoints: Sequence[str]) -> tuple[Session, str]:
+        return open_session("client", connect=endpoints, shared_memory=False, tls=tls), ", ".join(endpoints)
+
     try:
         if connect and not listen:
-            return open_session("client", connect=connect, shared_memory=False), ", ".join(connect)
+            return joined(connect)
         try:
-            session = open_session("server", listen=listen or None, connect=connect, shared_memory=False)
-            return session, ", ".join(listen or [default_endpoint()])
+            session = open_session(
+                "server", listen=listen or None, connect=connect, shared_memory=False, tls=tls, access=access
+            )
+            return session, ", ".join(listen or [usual])
         except ConnectionFailed:
             if listen:
                 raise
-            return open_session("client", connect=[default_endpoint()], shared_memory=False), default_endpoint()
+            return joined([usual])
     except ConnectionFailed as error:
         raise ClientError(str(error)) from None

@@ -1,18 +1,20 @@
 # SPDX-License-Identifier: MIT
 """A worker of a pool (--server '*'): finds the servers of an address, hears their needs, and says which to serve.
 
-What servers tell is not trusted: it is bounded, and one that says that it needs a worker and sends it no job is taken
-for one without a need for a while.
+What servers tell is not trusted (trust.py). One that has sent no job yet is tried beside those that have, so that a
+name without a server costs no work. Each try that comes to nothing makes the pause before the next ones longer.
 """
 
 import math
+import random
 import threading
 import time
 from collections.abc import Callable, Mapping
 
 import zenoh
 
-from precond_worker.pool_choice import PoolChoice, ServerNeed
+from precond_worker.network.trust import Sent, Speakers, Trust
+from precond_worker.pool_choice import LEAST, PoolChoice, ServerNeed
 from protocol.channels import CHANNELS, key, name_in, server_in
 from protocol.counters import Counters
 from protocol.messages_pb2 import Need
@@ -22,14 +24,15 @@ from protocol.validate import check_header, parse
 EVERY = "*"
 MAX_SERVERS = 64  # served at a time without being named
 MAX_KNOWN = 4096  # servers, and tokens of each
-SILENT = 2.0  # s without a need after which a server is served as one of a version that tells none
-NO_JOB = 10.0  # s without a job from a server that says that it needs a worker
-DISTRUST = 60.0  # s for which such a server has no need
+SILENT = 2.0  # s without a need after which a server is served as one that tells none
+TRIED = 8  # servers at a time that have sent no job yet, while none has
+TRIED_SHARE = 0.01  # part of this worker that such a server is told to have, beside others
+FIRST_PAUSE, LONGEST_PAUSE = 10.0, 600.0  # s in which none is tried after one that sent no job
 MOST_LOST = 64.0  # s of solving lost a second, by as many cores
 
 
 class Pool:
-    """The servers of one session. wake: set when one comes or goes. jobs: returns the jobs that a server has sent
+    """The servers of one session. wake: set when one comes or goes.
 
     Methods but the callbacks of zenoh are for the main loop.
     """
@@ -39,12 +42,14 @@ class Pool:
         clock: Callable[[], float] = time.monotonic,
     ):  # fmt: skip
         self._choice, self._counters, self._wake, self._clock = PoolChoice(name), counters, wake, clock
+        self._random, self._trust, self._speakers = random.Random(name), Trust(), Speakers()
+        self._kept: tuple[str, ...] = ()  # seats at servers that have sent jobs, while another is tried
+        self._tried: tuple[str, ...] = ()  # beside the seats, while no server has sent a job
+        self._pause, self._try_again = FIRST_PAUSE, float("-inf")
         self._lock = threading.Lock()
         self._tokens: dict[str, dict[int, None]] = {}  # incarnations by server
         self._since: dict[str, float] = {}  # when a server was found
         self._needs: dict[str, tuple[float, ServerNeed]] = {}
-        self._jobs: dict[str, tuple[float, int]] = {}  # of servers that are served: when their number last grew
-        self._distrusted: dict[str, float] = {}  # until when
         self._needs_heard = session.declare_subscriber(key("need", EVERY), self._need)
         self._tokens_seen = session.liveliness().declare_subscriber(
             key("alive_server", EVERY), self._token, history=True
@@ -74,41 +79,79 @@ class Pool:
             server = server_in(sample.key_expr)
             with self._lock:
                 incarnations = set(self._tokens.get(server, ()))
-            need = read_need(bytes(sample.payload.to_bytes()), incarnations)
+            message = read_need(bytes(sample.payload.to_bytes()), incarnations)
         except Refused as refusal:
             self._counters.refuse(refusal)
             return
         with self._lock:
-            self._needs[server] = self._clock(), need
+            now = self._clock()
+            self._speakers.hear(server, message.header.incarnation, message.header.sequence, now)
+            self._needs[server] = now, ServerNeed(message.lost, message.workers)
 
-    def wanted(self, jobs: Mapping[str, int]) -> dict[str, float]:
-        """Returns the servers to serve, and which part of this worker each has. jobs: of those served, sent so far"""
-        now = self._clock()
+    def wanted(self, sent: Mapping[str, Sent]) -> dict[str, float]:
+        """Returns the servers to serve, and which part of this worker each has. sent: by those that are served"""
+        now, trust = self._clock(), self._trust
         with self._lock:
-            found, needs = dict(self._since), dict(self._needs)
-        told = {name: need for name, (heard, need) in needs.items() if name in found and now - heard < 2 * SILENT}
-        seats = self._choice.update({name: self._trusted(name, need, jobs, now) for name, need in told.items()}, now)
-        silent = [name for name, since in found.items() if name not in told and now - since > SILENT]
-        wanted = [*seats, *silent[: MAX_SERVERS - len(seats)]]
-        return {name: 1 / len(wanted) for name in wanted}
+            found = dict(self._since)
+            needs = {
+                name: need for name, (heard, need) in self._needs.items()
+                if name in found and now - heard < 2 * SILENT and not self._speakers.contested(name, now)
+            }  # fmt: skip
+            self._speakers.keep(found)
+        trust.keep(found)
+        silent = [name for name, since in found.items() if name not in needs and now - since > SILENT]
+        asking = {name for name, need in needs.items() if need.lost > 0}
+        asking |= {name for name in silent if not trust.is_proven(name)}
+        proven_before = {name for name in sent if trust.is_proven(name)}
+        missed = trust.update(sent, asking, now)
+        if any(trust.is_proven(name) for name in sent.keys() - proven_before):
+            self._pause = FIRST_PAUSE
+        elif missed - proven_before:
+            self._try_again = now + self._pause
+            self._pause = min(2 * self._pause, LONGEST_PAUSE)
+        seats = self._seats(needs, now)
+        unproven = [name for name in silent if not trust.is_proven(name) and not trust.is_avoided(name, now)]
+        served = [*seats, *(name for name in silent if trust.is_proven(name)), *unproven[:TRIED]][:MAX_SERVERS]
+        proven = sum(map(trust.is_proven, served))
+        if not proven:
+            return {name: 1 / len(served) for name in served}
+        return {name: 1 / proven if trust.is_proven(name) else TRIED_SHARE for name in served}
 
-    def _trusted(self, name: str, need: ServerNeed, jobs: Mapping[str, int], now: float) -> ServerNeed:
-        """Returns the need of a server, none if it has sent no job though it says that it needs a worker."""
-        if name in jobs:
-            since, number = self._jobs.get(name, (now, -1))
-            if jobs[name] != number:
-                since = now
-            self._jobs[name] = since, jobs[name]
-            if now - since > NO_JOB and need.lost > 0:
-                self._distrusted[name] = now + DISTRUST
-        else:
-            self._jobs.pop(name, None)
-        if self._distrusted.get(name, 0.0) > now:
-            return ServerNeed(0.0, need.workers)
-        return need
+    def reject(self, server: str) -> None:
+        """Avoids a server for a while, since it cannot be served."""
+        self._trust.reject(server, self._clock())
+
+    def _seats(self, needs: Mapping[str, ServerNeed], now: float) -> list[str]:
+        """Returns the seats that the choice takes; while it tries a server, those that it had before, too."""
+        trust = self._trust
+        shown = {}
+        needed = any(trust.is_proven(name) and need.lost > LEAST for name, need in needs.items())
+        for name, need in needs.items():
+            proven, avoided = trust.is_proven(name), trust.is_avoided(name, now)
+            if proven:
+                shown[name] = ServerNeed(0.0, need.workers) if avoided else need
+            elif not avoided and (name in self._choice.seats or not needed or now >= self._try_again):
+                shown[name] = need
+        kept = tuple(name for name in self._kept if name in shown)
+        if kept and not any(name in shown for name in self._choice.seats):
+            self._choice.seats = kept
+        seats = self._choice.update(shown, now)
+        proven_seats = [name for name in shown if trust.is_proven(name)]
+        if all(map(trust.is_proven, seats)):
+            self._kept, self._tried = seats, ()
+            return list(seats)
+        if proven_seats:
+            self._kept = kept or tuple(name for name in self._tried if name in proven_seats)
+            return list(dict.fromkeys((*seats, *self._kept)))
+        others = [name for name in shown if shown[name].lost > LEAST and name not in seats]
+        tried = [name for name in self._tried if name in others]
+        fresh = [name for name in others if name not in tried]
+        missing = max(min(TRIED - len(seats) - len(tried), len(fresh)), 0)
+        self._tried = (*tried, *self._random.sample(fresh, missing))
+        return [*seats, *self._tried]
 
 
-def read_need(data: bytes, incarnations: set[int]) -> ServerNeed:
+def read_need(data: bytes, incarnations: set[int]) -> Need:
     """Reads a message. incarnations: of its server, that have a token. Raises Refused."""
     message = parse(Need, data, CHANNELS["need"].limit)
     check_header(message)
@@ -118,4 +161,4 @@ def read_need(data: bytes, incarnations: set[int]) -> ServerNeed:
         value = getattr(message, field)
         if not (math.isfinite(value) and 0 <= value <= most):
             raise Refused(f"Need.{field} is {value}; allowed: 0 to {most:g}", "not_finite")
-    return ServerNeed(message.lost, message.workers)
+    return message

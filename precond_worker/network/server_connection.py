@@ -78,7 +78,8 @@ class ServerConnection:
             time.sleep(0.1)
 
     def _taken(self, who: str) -> NameTaken:
-        return NameTaken(f"{who} of server {self.server} is called {self.name}; --name gives this one its own")
+        text = f"{who} of server {self.server} is called {self.name}; --name gives this one its own"
+        return NameTaken(text, self.server)
 
     def _heard(self, sample: zenoh.Sample) -> None:
         """Handles a hello under this name, which may be of another worker; the larger process id gives way."""

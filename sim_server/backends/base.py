@@ -125,11 +125,12 @@ class LoopState(Protocol):
     """Memory that a running loop shares with other threads.
 
     step: number of completed steps. start_time: of the simulation at step 0 [s]
-    realtime, patient, stop, pause: 0 or 1, set by others
+    realtime, patient, stop: 0 or 1, set by others
+    pause: number of a pause, 0: none, set by others; halted: the pause in which the loop stands still, 0: it does not
     single: steps that it is to make while it is paused
     hold: number of a request to stand still between two steps, 0: none; held: the last one that it has followed
     frame_every, energy_every: steps between those that are reported, 0: none
-    deadline: 0 while the loop stands still in a pause [s]
+    deadline: of the next step, 0: at once [s]
     late_steps, frames_dropped, records_dropped, others_dropped (reactions on what is no obstacle): numbers so far
     """
 
@@ -139,6 +140,7 @@ class LoopState(Protocol):
     patient: int
     stop: int
     pause: int
+    halted: int
     single: int
     hold: int
     held: int

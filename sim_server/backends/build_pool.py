@@ -16,6 +16,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import IO
 
+from sim_server.backends.cpu.processors import usable_processors
+
 LOOK = 5e-3  # s between looks at the compilers that run
 KEPT = 0.3  # s that it takes at most to fetch a kernel from a cache
 PATIENCE = 2.0  # s for a compiler to end when told
@@ -54,7 +56,7 @@ class Compilers:
     """Runs up to `cores` compilers at a time.
 
     progress: called while somebody waits, with the number of texts compiled and of all asked for (0: not known), both
-    counted since there was last nothing to do.
+    counted since somebody last waited until there was nothing to do.
     """
 
     def __init__(self, cores: int):
@@ -65,6 +67,7 @@ class Compilers:
         self._running: dict[Path, Running] = {}
         self._failed: dict[Path, str] = {}
         self._done = self._total = 0
+        self._told = False  # somebody has waited since they were counted anew
 
     @property
     def running(self) -> int:
@@ -77,8 +80,8 @@ class Compilers:
         with self._lock:
             if job.library in self._running or any(job.library == other.library for other in self._waiting):
                 return
-            if not self._waiting and not self._running:
-                self._done = self._total = 0
+            if self._told and not self._waiting and not self._running:
+                self._done, self._total, self._told = 0, 0, False
             self._failed.pop(job.library, None)
             self._waiting.append(job)
             self._total += 1
@@ -92,6 +95,7 @@ class Compilers:
             if self.progress is not None:
                 self.progress(self._done, self._total)
             time.sleep(LOOK)
+        self._told = self._told or waited
         if waited and self.progress is not None:
             self.progress(self._done, self._total)
 
@@ -161,5 +165,5 @@ def _start(job: Job) -> Running:
     return Running(job, process, said)
 
 
-compilers = Compilers(len(os.sched_getaffinity(0)))
+compilers = Compilers(usable_processors())
 atexit.register(compilers.stop)

@@ -100,8 +100,8 @@ def _make(folder: Path, hosts: list[str], clients: list[tuple[str, str]], days: 
 def _print_rules(folder: Path, servers: list[str]) -> None:
     """Prints `access_control` and the settings of TLS as zenohd takes them."""
     from protocol.channels import check_name
+    from protocol.network.access_rules import access_rules
     from protocol.network.identity import SERVER, identity_of, roles_of
-    from sim_server.network.access_rules import access_rules
 
     identity = identity_of(folder, (SERVER,))
     print(

@@ -54,6 +54,7 @@ class Simulation:
         if not isinstance(scene, Scene):
             scene = Scene.load(scene) if isinstance(scene, str | Path) else Scene(scene)
         built = (_WithForces if forces else simulations.Simulation)(scene.checked, device)
+        _tell_of_cuts(built)
         self.scene = scene
         self.records: NDArray[Any] = np.zeros(0, built.engine.records_dtype)  # of the last call of `step`
         self._external = built.effects.get(ExternalForces.name)
@@ -243,6 +244,18 @@ class _WithForces(simulations.Simulation):
         effects = super().make_effects()
         effects[ExternalForces.name] = ExternalForces(self.world)
         return effects
+
+
+def _tell_of_cuts(simulation: simulations.Simulation) -> None:
+    """Says what in the scene cuts only beside the steps of a server."""
+    edges = [f"obstacle {o.name!r} has an edge" for o in simulation.scene.obstacles or () if o.edge is not None]
+    listed = [(b.name, b.effects.get("cutting")) for b in simulation.world.bodies]
+    tears = [f"object {name!r} has cutting.tear" for name, cutting in listed if cutting and cutting.tear is not None]
+    if found := [*edges, *tears]:
+        log.warning(
+            '%s: that cuts in a server alone; here set("NAME.cutting.removed", "3 7-9") removes elements',
+            " and ".join(found),
+        )
 
 
 def _source(simulation: simulations.Simulation, workers: int) -> FactorSource | None:

@@ -2,7 +2,6 @@
 """One scene at many values: a run for each, in processes beside each other, and a table of what came out."""
 
 import csv
-import os
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import nullcontext
@@ -17,6 +16,7 @@ from rich.progress import track
 from rich.table import Table as Drawn
 
 from protocol import messages_pb2 as pb
+from sim_server.backends.cpu.processors import usable_processors
 from sim_server.embedded.scene import Scene
 from sim_server.embedded.simulation import Simulation
 from sim_server.errors import InputError
@@ -183,7 +183,7 @@ def _result(waiting: Any) -> dict[str, Any]:
 
 def _half() -> int:
     """Half of the cores that this process may use: a thread that makes factors stands beside the steps of each run."""
-    return max(1, len(os.sched_getaffinity(0)) // 2)
+    return max(1, usable_processors() // 2)
 
 
 def _text(value: Any) -> str:

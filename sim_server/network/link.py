@@ -15,6 +15,7 @@ from typing import Self
 import zenoh
 from zenoh.handlers import RingChannel
 
+from protocol.access.rights import Rights
 from protocol.channels import PROTOCOL, SERVER_NAME, check_name, key, name_in
 from protocol.counters import Counters
 from protocol.messages_pb2 import (
@@ -31,17 +32,16 @@ from protocol.messages_pb2 import (
     Steps,
     Topology,
 )
+from protocol.network.access_rules import access_rules
 from protocol.network.identity import Identity, roles_of
 from protocol.network.session import open_session
 from protocol.refused import Refused
 from protocol.shared_memory.limits import POOL_LIMIT
 from protocol.shared_memory.pool import Slot, SlotPool, SlotsUnusable
-from sim_server.network.access_rules import access_rules
 from sim_server.network.dispatch import Dispatch
 from sim_server.network.name_claim import NameClaim
 from sim_server.network.publishers import Publishers
 from sim_server.network.queryables import Queryables
-from sim_server.network.rights import Rights
 from sim_server.network.send_queue import SendQueue
 
 log = logging.getLogger(__name__)

@@ -8,6 +8,7 @@ from functools import partial
 import zenoh
 
 from protocol.access.client_name import check_client
+from protocol.access.rights import Rights
 from protocol.channels import CHANNELS, FORMER_COMMAND, PROTOCOL, ROOT, check_name, commands, key, name_in
 from protocol.counters import Counters
 from protocol.messages_pb2 import Command, Echo, Header, Reply
@@ -19,7 +20,6 @@ from protocol.validate import check_header, check_numbers, check_strings, parse
 from sim_server.network.coalesce import coalesce_moves
 from sim_server.network.command_queue import CommandQueue, PendingCommand
 from sim_server.network.name_claim import NameClaim
-from sim_server.network.rights import Rights
 from sim_server.network.send_queue import SendQueue
 
 log = logging.getLogger(__name__)

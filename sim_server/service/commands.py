@@ -47,6 +47,7 @@ class Commands:
         self.stopping = False
         self.supervisor: Supervisor | None = None
         self._owners: set[str] = set()
+        self._pauses = 0
 
     @property
     def engine_paused(self) -> bool:
@@ -55,8 +56,9 @@ class Commands:
 
     @property
     def engine_halted(self) -> bool:
-        """True if the loop stands still after `pause`: it sets its deadline to 0 then, and has no single steps left."""
-        return bool(self.engine.loop.single <= 0 and self.engine.loop.deadline == 0)
+        """True if the loop stands still after the newest `pause`, and has no single steps left."""
+        loop = self.engine.loop
+        return bool(loop.single <= 0 and loop.halted == loop.pause != 0)
 
     def make_steps(self, steps: int) -> None:
         """Has the loop, which stands still in a pause, make some steps more."""
@@ -167,10 +169,10 @@ class Commands:
 
     def _pause(self, command: pb.Command) -> pb.Reply:
         unchanged, loop = self.engine_paused, self.engine.loop
-        if not unchanged and not loop.realtime:
-            loop.deadline = -1.0  # not looked at without a pace; 0 again once the loop stands still
         loop.single = 0  # single steps end, too
-        loop.pause = 1
+        if not unchanged:
+            self._pauses += 1  # a number of its own: the loop may still stand in the last one
+            loop.pause = self._pauses
         return pb.Reply(status=self._status_of("paused"), unchanged=unchanged)
 
     def _step(self, command: pb.Command) -> pb.Reply:

@@ -65,7 +65,10 @@ class Halts:
         stands = commands.engine_halted
         for until, reply, answer in self._waiting:
             halted = stands or not commands.engine_paused  # or it goes on already
-            if (halted and answer.status.state == "paused") or ended or time.monotonic() >= until:
+            late = time.monotonic() >= until
+            if (halted and answer.status.state == "paused") or ended or late:
+                if answer.status.state == "paused" and not (stands or ended):
+                    answer.status.state = "running"  # what it says is no more so, or not yet
                 self._send(reply, answer)
             else:
                 waiting.append((until, reply, answer))

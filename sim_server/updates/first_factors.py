@@ -44,7 +44,6 @@ class FirstFactors:
     def run(self) -> bool:
         """Makes the first step. False: the loop was stopped meanwhile, in the middle of it."""
         engine = self._driver.engine
-        deadline, engine.loop.deadline = engine.loop.deadline, -1.0  # it stands still, but not between two steps
         engine.assemble()
         begun = seen = self.begun = self._clock()
         while self._waiting and not engine.loop.stop:
@@ -62,7 +61,6 @@ class FirstFactors:
         engine.settle_factors()
         engine.restart_clock()
         engine.solve()
-        engine.loop.deadline = deadline
         self.done = True
         return True
 

@@ -83,6 +83,18 @@ def test_progress_counts_texts_until_nothing_is_left_to_do(tmp_path):
     assert set(seen) == {(0, 1), (1, 1)}
 
 
+def test_progress_counts_what_was_done_before_anybody_waited(tmp_path):
+    compilers, seen = Compilers(1), []
+    compilers.begin(job(tmp_path, "a", 'touch "$2"'))
+    deadline = time.monotonic() + 60
+    while compilers.running:
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+    compilers.progress = lambda done, total: seen.append((done, total))
+    finish(compilers, job(tmp_path, "b", 'sleep 0.05; touch "$2"'))
+    assert set(seen) == {(1, 2), (2, 2)}
+
+
 def test_what_nobody_has_waited_for_is_kept_at_the_end(tmp_path):
     compilers, one = Compilers(2), job(tmp_path, "a", 'touch "$2"')
     compilers.begin(one)

@@ -4,6 +4,7 @@
 import ctypes
 import gc
 import threading
+import time
 import weakref
 
 import numpy as np
@@ -224,6 +225,36 @@ def test_stop_ends_a_run_and_pause_holds_it():
     sim.engine.loop.pause = 0
     thread.join(20)
     assert done == [3]
+
+
+@pytest.mark.parametrize("realtime", [0, 1])
+def test_no_step_is_made_once_the_loop_says_that_it_stands_still(realtime: int):
+    sim = falling(dt=1e-4)
+    loop = sim.engine.loop
+    loop.realtime, loop.pause = realtime, 1
+    thread = threading.Thread(target=lambda: sim.engine.run(1 << 40))
+    thread.start()
+
+    def stands() -> int:
+        end = time.monotonic() + 20
+        while not (loop.single <= 0 and loop.halted == loop.pause):
+            assert time.monotonic() < end
+        return sim.engine.step
+
+    try:
+        assert stands() == 0, "before the first step"
+        for number in range(2, 300):
+            loop.pause = 0
+            time.sleep(1e-4 * (number % 5))
+            loop.pause = number
+            step = stands()
+            time.sleep(1e-4)
+            assert sim.engine.step == step
+            loop.single = 2
+            assert stands() == step + 2
+    finally:
+        loop.stop = 1
+        thread.join(20)
 
 
 def test_the_clock_is_what_kernels_read():

@@ -423,9 +423,9 @@ def test_a_paused_loop_makes_single_steps_and_stands_still_on_request():
     thread = threading.Thread(target=lambda: scene.loop.run(30))
     thread.start()
     loop.single = 3
-    while not (scene.loop.step == 3 and loop.single == 0 and loop.deadline == 0):
+    while not (loop.single == 0 and loop.halted == 1):
         time.sleep(1e-3)
-    assert loop.launched == 3
+    assert scene.loop.step == loop.launched == 3
     loop.hold = 7
     while loop.held != 7:
         time.sleep(1e-3)

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: MIT
 """Simulations in a program of one's own: known motions, views of memory, meshes of arrays, and what is refused."""
 
+import logging
+
 import numpy as np
 import pytest
 
@@ -143,6 +145,20 @@ def test_values_of_numpy_are_set_and_several_at_once_or_none():
         with pytest.raises(InputError, match="young"):
             simulation.set({"gravity.g": [0, 0, 0], "cube.corotational.young": np.nan})
         assert values() == ("[0.0, -9.0, 0.0]", "30000.0")
+
+
+def test_what_cuts_in_a_server_alone_is_told(caplog):
+    mesh = {"bar": [1, 1, 2], "size": [0.1, 0.1, 0.2]}
+    with caplog.at_level(logging.WARNING), wf.Simulation(falling(mesh, cutting={"tear": 50})) as simulation:
+        (line,) = [r.getMessage() for r in caplog.records]
+        assert line.startswith("object 'cube' has cutting.tear: that cuts in a server alone")
+        masses = simulation.inside.world.mass.sum()
+        simulation.set("cube.cutting.removed", "0-2")
+        simulation.step()
+        assert simulation.inside.world.mass.sum() < masses
+    caplog.clear()
+    wf.Simulation(falling(mesh, cutting=True)).close()
+    assert not caplog.records
 
 
 def test_a_scene_of_the_package_is_read_with_other_values():

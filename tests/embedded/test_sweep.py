@@ -10,6 +10,8 @@ import numpy as np
 import pytest
 
 import warpfactor as wf
+from sim_server.backends.cpu import processors
+from sim_server.embedded import sweep
 from sim_server.errors import InputError
 
 YOUNG = "object.bar.effects.corotational.young"
@@ -126,3 +128,11 @@ def test_submitit_runs_them(tmp_path):
     assert "error" not in table.columns, table.rows
     assert (table["converged"] == 1).all() and os.getpid() not in table["process"]
     assert len(list((tmp_path / "jobs").glob("*_result.pkl"))) == 2
+
+
+def test_as_many_runs_as_control_groups_allow(monkeypatch):
+    """In a container of 4 processors on a machine of 64."""
+    monkeypatch.setattr(processors.os, "sched_getaffinity", lambda _: set(range(64)))
+    monkeypatch.setattr(processors, "quota", lambda: 3.5)
+    monkeypatch.setattr(sweep, "_found", lambda jobs, executor, count: [{"count": count}])
+    assert wf.sweep(SCENE, {"dt": [0.01]}, 0.02)["count"].tolist() == [2]

@@ -8,13 +8,13 @@ from typing import Any
 import pytest
 from google.protobuf.message import DecodeError
 
+from protocol.access.rights import Rights
 from protocol.channels import PROTOCOL, key
 from protocol.counters import Counters
 from protocol.messages_pb2 import Command, Header, Interaction, ObstacleTarget, Reply, Vector
 from protocol.refused import Refused
 from sim_server.network.coalesce import coalesce_moves
 from sim_server.network.queryables import Queryables
-from sim_server.network.rights import Rights
 
 NAN = float("nan")
 

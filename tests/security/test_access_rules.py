@@ -5,8 +5,8 @@ import pytest
 import zenoh
 
 from protocol.access.roles import ALWAYS, ROLES, RULING, TOUCHING, VERBS, check_identity, identity_in
+from protocol.network.access_rules import ALL_MESSAGES, access_rules
 from protocol.network.identity import SERVER
-from sim_server.network.access_rules import ALL_MESSAGES, access_rules
 from sim_server.network.queryables import QUERYABLES
 from sim_server.service import commands
 

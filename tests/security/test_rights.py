@@ -5,13 +5,13 @@ import logging
 
 import pytest
 
+from protocol.access.rights import Rights
 from protocol.access.roles import VERBS
 from protocol.counters import Counters
 from protocol.messages_pb2 import Command, Reply
 from protocol.refused import Refused
 from sim_server.network.command_queue import CommandQueue
 from sim_server.network.rate_limiter import BURST
-from sim_server.network.rights import Rights
 
 RIGHTS = Rights({"eve": "viewer", "bob": "operator", "mill": "worker"})
 

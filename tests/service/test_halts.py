@@ -19,9 +19,17 @@ class Server:
         sim = simulation(bar((2, 1, 1), fixed="X < 0.01"))
         self.commands = Commands(sim, lambda *_: None)
         self.halts, self.loop = Halts(self.commands), sim.engine.loop
-        self.loop.pause, self.loop.deadline = 1, 0.0
         self.answers: dict[int, tuple[str, str]] = {}
         self._sent = 0
+        self.send("pause")
+        self.stand_still()
+        self.answers.clear()
+        self._sent = 0
+
+    def stand_still(self) -> None:
+        """What the loop does once the step under way has ended, or the last one of single steps."""
+        self.loop.single, self.loop.halted = 0, self.loop.pause
+        self.halts.answer()
 
     def send(self, verb: str, steps: int = 0) -> None:
         number, self._sent = self._sent, self._sent + 1
@@ -69,3 +77,27 @@ def test_a_pause_ends_single_steps_that_wait(server: Server) -> None:
     for _ in "xy":
         server.halts.answer()
     assert server.loop.single == 0 and server.answers == dict.fromkeys(range(3), ("paused", ""))
+
+
+def test_a_pause_is_answered_by_its_own_standing_still(server: Server) -> None:
+    """The loop still stands in the first pause when the second one comes: it may be about to make a step."""
+    server.send("resume")
+    server.send("pause")
+    server.halts.answer()
+    assert list(server.answers) == [0], "the loop has not seen the second one"
+    server.stand_still()
+    assert server.answers[1] == ("paused", "")
+
+
+def test_a_pause_of_a_long_step_says_that_it_runs(server: Server, monkeypatch: pytest.MonkeyPatch) -> None:
+    server.send("resume")
+    monkeypatch.setattr(halts, "HALT_TIMEOUT", 0.0)
+    server.send("pause")
+    server.halts.answer()
+    monkeypatch.undo()
+    assert server.answers[1] == ("running", "")
+    server.send("pause")
+    server.halts.answer()
+    assert 2 not in server.answers, "the client asks again"
+    server.stand_still()
+    assert server.answers[2] == ("paused", "")

@@ -173,15 +173,15 @@ def test_workers_go_where_they_are_needed_most_and_lose_no_job() -> None:
             time.sleep(0.01)
             return found
 
-        def until(wanted: dict[str, int]) -> None:
-            end = time.monotonic() + PATIENCE
-            while (found := counts()) != wanted:
+        def until(wanted: dict[str, int], seconds: float = 0.0) -> None:
+            """Until it is so, and stays so."""
+            now = time.monotonic()
+            end, since = now + PATIENCE, now
+            while (found := counts()) != wanted or time.monotonic() - since < seconds:
                 assert time.monotonic() < end, found
+                since = since if found == wanted else time.monotonic()
 
-        until({"light": 1, "heavy": 2})
-        end = time.monotonic() + 4
-        while time.monotonic() < end:
-            assert counts() == {"light": 1, "heavy": 2}, "they stay"
+        until({"light": 1, "heavy": 2}, 4.0)
         demands["light"] = 12.0
         until({"light": 2, "heavy": 1})
         assert light.factors and heavy.factors

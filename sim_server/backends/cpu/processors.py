@@ -11,9 +11,14 @@ log = logging.getLogger(__name__)
 CGROUPS, OWN_CGROUPS = Path("/sys/fs/cgroup"), Path("/proc/self/cgroup")
 
 
+def usable_processors() -> int:
+    """Returns how many processors this process may keep busy, by its affinity and the limits of control groups."""
+    return max(1, math.ceil(min(len(os.sched_getaffinity(0)), quota())))
+
+
 def usable_threads(wanted: int) -> int:
     """Returns `wanted`, or as many as there are processors for this process where those are fewer; says so then."""
-    allowed = max(1, math.ceil(min(len(os.sched_getaffinity(0)), quota())))
+    allowed = usable_processors()
     if wanted > allowed:
         log.warning(
             "solver.threads = %d: this process may use %d processor%s, so the step has %d thread%s",

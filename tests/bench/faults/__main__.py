@@ -41,7 +41,7 @@ with open_session("client", connect=[sys.argv[1]], shared_memory=False) as sessi
     end, junk, count = time.monotonic() + float(sys.argv[2]), os.urandom(1 << 20), 0
     while time.monotonic() < end:
         for channel in ("factor", "pattern", "worker"):
-            name = {"worker": "evil"} if channel == "worker" else {"object": "beam"}
+            name = {"worker": "evil"} | ({} if channel == "worker" else {"object": "beam"})
             session.zenoh.put(key(channel, **name), junk[: 1 << 10 * (count % 3)], attachment=junk[:100])
         count += 1
 """

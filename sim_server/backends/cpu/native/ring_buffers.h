@@ -93,7 +93,8 @@ struct Rings {
     std::atomic<int64_t> frames_dropped, records_dropped, late_steps;
     int32_t realtime;                      // keep pace with the wall clock
     int32_t patient;                       // wait for room in the rings instead of dropping (no deadline to miss)
-    std::atomic<int32_t> stop, pause;
+    std::atomic<int32_t> stop;
+    std::atomic<int32_t> pause, halted;    // number of a pause, 0: none; the pause in which the loop stands still, 0: it does not
     std::atomic<int64_t> single;           // steps that the loop is to make while it is paused
     std::atomic<int64_t> hold, held;       // number of a request to stand still between two steps, 0: none; the last one that it has followed
     double deadline;                       // steady clock, of the next step; 0: now
@@ -190,17 +191,18 @@ template <class Meanwhile>
 static bool wait_until_due(Rings& rings, Meanwhile meanwhile) {
     while (!rings.stop.load()) {
         const int64_t request = rings.hold.load();
-        const bool paused = rings.pause.load(std::memory_order_relaxed) && rings.single.load() <= 0;
-        if (!request && !paused) break;
+        const int32_t pause = rings.single.load() <= 0 ? rings.pause.load() : 0;
+        if (!request && !pause) break;
         meanwhile();
         if (request) rings.held.store(request);
+        if (pause) {
+            rings.deadline = 0;
+            rings.halted.store(pause);
+        }
         nap(request ? 1e-4 : 1e-3);
-        if (paused) rings.deadline = 0;
     }
-    if (rings.pause.load(std::memory_order_relaxed) && rings.single.load() > 0) {  // a deadline of 0 would say that it stands still
-        if (rings.deadline == 0) rings.deadline = rings.realtime ? now() : -1;
-        rings.single.fetch_sub(1);
-    }
+    rings.halted.store(0);  // before `single` says that no step is left
+    if (rings.pause.load() && rings.single.load() > 0) rings.single.fetch_sub(1);
     rings.late = 0;
     if (rings.realtime && !rings.stop.load()) {
         double t = now();
