@@ -38,6 +38,7 @@ TOKEN_QUERY_INTERVAL = 1.0  # s between queries for tokens of workers that send 
 FAST_SEND = 0.05  # s in which a fast link takes a job as bytes; zenoh drops what is not taken within 0.25 s
 MAX_NEW_PATTERNS = 256  # that wait to be prepared for; older ones are prepared for when their factors come
 SMALL_BLOCKS = 20_000  # of the largest matrix, if several jobs may wait at a worker
+MOST_ALONE = 32  # jobs in flight at a worker while they go alone, each with slots of its own, which are slow to make
 QUEUE_SECONDS = 0.02  # s of factorizations that wait at a worker at most
 LOOK_PERIOD = 1e-3  # s between looks at which leases are over
 MAX_SENT = 4096  # times of jobs that are remembered
@@ -392,7 +393,8 @@ class Dispatch(FactorSource):
         most = 1
         small = self.decoder.most_blocks <= SMALL_BLOCKS and self._pool is not None
         if info is not None and info.shared_memory and seconds is not None and small:
-            most = max(1, min(info.most_jobs, MOST_JOBS, int(QUEUE_SECONDS / max(seconds, 1e-6))))
+            most = MOST_JOBS if info.batches and self.decoder.most_are_sized else MOST_ALONE
+            most = max(1, min(info.most_jobs, most, int(QUEUE_SECONDS / max(seconds, 1e-6))))
         return max(0, most - self.leases.count(worker))
 
     def _candidates(self, idle: list[str], available: list[str], object: str) -> list[str]:
