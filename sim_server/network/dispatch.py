@@ -95,7 +95,7 @@ class Dispatch(FactorSource):
         self._answered_at: dict[str, float] = {}  # likewise, of the answers with a factor
         self._fast_links: set[str] = set()  # workers without shared memory whose link takes a job at once
         self._thread = ThreadPoolExecutor(1, "large factors")
-        self._decoding: list[Decoding] = []
+        self._decoding: dict[int, Decoding] = {}  # by number of the job
         self._factors: list[Factor] = []
         self._failures: list[tuple[str, str]] = []
         self._patterns: list[tuple[str, FactorPattern]] = []
@@ -505,7 +505,7 @@ class Dispatch(FactorSource):
             self._on_expired(job, f"was lost: worker {job.worker} says that it has no job")
 
     def _sent_at(self, job: InFlightJob) -> float:
-        return float("inf") if self._is_decoded(job) else self._sent.get(job.number, float("inf"))
+        return float("inf") if job.number in self._decoding else self._sent.get(job.number, float("inf"))
 
     def _on_expired(self, job: InFlightJob, why: str) -> None:
         self._fast_links.discard(job.worker)  # zenoh may have dropped the job
@@ -563,10 +563,11 @@ class Dispatch(FactorSource):
             return self.leases.finish(job, None if message.failure else message.seconds)
         decode = partial(self.decoder.decode, message, sample.payload, job)
         if not message.failure and 4 * message.nonzeros > LARGE:  # its bytes are copied and checked beside the caller
-            if self._is_decoded(job):
+            if job.number in self._decoding:
                 raise Refused(f"Factor.job is {job.number}, already answered", "duplicate")
             future = self._thread.submit(decode)
-            self._decoding.append(Decoding(job, future, future.result, message.seconds, _slots_used(message)))
+            made = Decoding(job, future, future.result, message.seconds, _slots_used(message))
+            self._decoding[job.number] = made
             return
         self._take_factor(job, decode, message.failure, message.seconds, _slots_used(message))
 
@@ -576,7 +577,7 @@ class Dispatch(FactorSource):
         now, worker = self._clock(), message.worker
         self._registry.mark_seen(worker, now)
         duration, large = 0.0, 4 * sum(message.nonzeros) > LARGE
-        beside: list[tuple[int, InFlightJob]] = []  # large all together: decoded beside the caller
+        beside: dict[int, tuple[int, InFlightJob]] = {}  # by number; large all together: decoded beside the caller
         for place, number in enumerate(message.jobs):
             try:
                 job = self.leases.match_answer(number, worker, None)
@@ -591,29 +592,22 @@ class Dispatch(FactorSource):
                 elif not large:
                     decode, told = partial(self.decoder.decode_one, message, place, job), message.seconds[place]
                     self._take_factor(job, decode, "", told, (message.matrix_shared, True), duration)
-                elif self._is_decoded(job) or any(other is job for _, other in beside):
+                elif number in self._decoding or number in beside:
                     raise Refused(f"FactorBatch.jobs has {number}, already answered", "duplicate")
                 else:
-                    beside.append((place, job))
+                    beside[number] = place, job
             except Refused as refusal:
                 self._counters.refuse(refusal)
         if beside:
-            future = self._thread.submit(self.decoder.decode_several, message, beside)
-            for k, (place, job) in enumerate(beside):
+            future = self._thread.submit(self.decoder.decode_several, message, list(beside.values()))
+            for k, (place, job) in enumerate(beside.values()):
                 take, by_slot = partial(_result, future, k), (message.matrix_shared, True)
-                self._decoding.append(Decoding(job, future, take, message.seconds[place], by_slot, duration))
-
-    def _is_decoded(self, job: InFlightJob) -> bool:
-        """True while the answer to a job is decoded beside the caller."""
-        return any(each.job.number == job.number for each in self._decoding)
+                self._decoding[job.number] = Decoding(job, future, take, message.seconds[place], by_slot, duration)
 
     def _take_decoded(self) -> None:
         """Takes the large factors that were decoded beside the caller, unless their jobs are over."""
-        done = [each for each in self._decoding if each.future.done()]
-        if not done:
-            return
-        self._decoding = [each for each in self._decoding if not each.future.done()]
-        for each in done:
+        for number in [number for number, each in self._decoding.items() if each.future.done()]:
+            each = self._decoding.pop(number)
             job = each.job
             try:
                 current = self.leases.match_answer(job.number, job.worker, job.epoch)
