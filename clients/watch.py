@@ -16,7 +16,7 @@ from rich.table import Table
 from rich.text import Text
 
 from clients.client import Client
-from clients.log.scalars import enum_name, reaction_name, status_name
+from clients.log.scalars import ended, enum_name, reaction_name
 from protocol import messages_pb2 as pb
 
 PERIOD = 0.5  # s between two readings
@@ -95,7 +95,7 @@ def places(status: pb.Status) -> Table | Text:
 
 def _status(found: pb.ObjectStatus) -> Text:
     away = found.last.status == pb.RUNAWAY
-    return Text("RUNAWAY", style="bold red") if away else Text(status_name(found.last.status))
+    return Text("RUNAWAY", style="bold red") if away else Text(ended(found.last))
 
 
 def _events(status: pb.Status) -> list[Table]:

@@ -19,6 +19,7 @@ from precond_worker.job import Job, accept
 from precond_worker.network.presence import ServerGone, ServersThere
 from precond_worker.network.server_connection import ServerConnection
 from precond_worker.remote_assembly import Assemblers
+from protocol.channels import WHOLE_PARTS
 from protocol.factor import FactorPattern
 from protocol.messages_pb2 import Factor
 from protocol.method import Method
@@ -200,6 +201,7 @@ class Worker:
         self._pending.clear()
         self._analyses.clear()
         self._assemblers.clear()
+        self._connection.offered.clear()
 
     def _enqueue(self, job: Job) -> None:
         waiting = self._pending.get(job.object)
@@ -210,6 +212,7 @@ class Worker:
         self._pending[job.object] = job
 
     def _count(self, job: Job) -> None:
+        self._connection.offered.withdraw(job.object)  # the server has the last one, or has given it up
         self._counters.add("jobs")
         self._counters.add("bulk_shared" if job.shared else "bulk_copied")
         if (job.batch is not None or job.message.HasField("matrix_slot")) and not job.shared:
@@ -315,9 +318,14 @@ class Worker:
         )
         payload = b""
         if pattern is not None and values is not None:
-            answer.pattern, answer.nonzeros, answer.checksum = pattern.id, pattern.nonzeros, checksum(values)
-            if not self._into_slot(message, answer, values):
-                payload = values.tobytes()
+            answer.pattern, answer.nonzeros = pattern.id, pattern.nonzeros
+            in_slot = self._into_slot(message, answer, values)
+            if not in_slot and 0 < WHOLE_PARTS * message.part_bytes < values.nbytes:
+                number, size = message.header.sequence, message.part_bytes
+                answer.parts.extend(connection.offered.offer(job.object, answer.header, number, values, size))
+            else:
+                answer.checksum = checksum(values)
+                payload = b"" if in_slot else values.tobytes()
         connection.send_factor(answer, payload)
         if values is not None:
             self._counters.add("factors")

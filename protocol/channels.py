@@ -16,6 +16,10 @@ MOST_JOBS = 256  # in flight at one worker, of small objects
 
 KIB, MIB, GIB = 1 << 10, 1 << 20, 1 << 30
 
+PART_BYTES = 4 * MIB  # of a part of a factor: smaller ones cost more time for each byte, larger ones hold others up
+WHOLE_PARTS = 4  # a factor of at most so many parts travels whole
+WHOLE_BYTES = WHOLE_PARTS * PART_BYTES
+
 
 @dataclass(frozen=True)
 class Channel:
@@ -47,9 +51,14 @@ CHANNELS: dict[str, Channel] = {
     "pattern": Channel(
         "pattern/{worker}/{object}", "FactorPattern", "worker", "when it is new", 256 * MIB, 0, "pattern of L"
     ),
-    "factor": Channel("factor/{worker}/{object}", "Factor", "worker", "one per matrix", 64 * KIB, GIB, "values of L"),
+    "factor": Channel(
+        "factor/{worker}/{object}", "Factor", "worker", "one per matrix", 64 * KIB, WHOLE_BYTES, "values of L"
+    ),
     "factors": Channel(
         "factors/{worker}", "FactorBatch", "worker", "one or several for each MatrixBatch", 512 * KIB, 0, "values of L"
+    ),
+    "part": Channel(
+        "part/{worker}", "FactorPart", "worker", "query, of large factors", 4 * KIB, PART_BYTES, "part of values of L"
     ),
     "worker": Channel("worker/{worker}", "WorkerInfo", "worker", "5 Hz", 16 * KIB, 0, "hello, then heartbeat"),
     "need": Channel("need", "Need", "server", "2 Hz", KIB, 0, "what more workers are worth to it"),

@@ -9,13 +9,14 @@ import numpy as np
 import xxhash
 from numpy.typing import NDArray
 
-from protocol.channels import CHANNELS
 from protocol.messages_pb2 import FactorPattern as PatternMessage
 from protocol.messages_pb2 import Header
 from protocol.refused import Refused
 from protocol.validate import all_finite, array, check_range, checksum
 
 __all__ = ["Factor", "FactorPattern", "Refused", "check_values", "pattern_id"]
+
+MOST_VALUES = (1 << 31) - 1  # of a factor, 8 GiB in float32: what a pattern may make its receiver prepare for
 
 Int32 = NDArray[np.int32]
 Int64 = NDArray[np.int64]
@@ -151,9 +152,8 @@ class FactorPattern:
         pattern.check()
         if message.nonzeros != pattern.nonzeros:
             raise Refused(f"FactorPattern.nonzeros is {message.nonzeros}; allowed: {pattern.nonzeros}", "pattern")
-        limit = CHANNELS["factor"].bulk // 8
-        if pattern.nonzeros > limit:
-            raise Refused(f"FactorPattern.nonzeros is {pattern.nonzeros}; allowed: at most {limit}", "size")
+        if pattern.nonzeros > MOST_VALUES:
+            raise Refused(f"FactorPattern.nonzeros is {pattern.nonzeros}; allowed: at most {MOST_VALUES}", "size")
         return pattern
 
 

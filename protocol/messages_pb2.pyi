@@ -146,7 +146,7 @@ class Group(_message.Message):
     def __init__(self, name: _Optional[str] = ..., elements: _Optional[bytes] = ..., faces: _Optional[bytes] = ..., nodes: _Optional[bytes] = ...) -> None: ...
 
 class Matrix(_message.Message):
-    __slots__ = ("header", "step", "warp", "blocks", "checksum", "factor_dtype", "method", "known_patterns", "lease", "factor_slot", "matrix_slot", "worker", "drop_tolerance", "fill", "omega", "nodes")
+    __slots__ = ("header", "step", "warp", "blocks", "checksum", "factor_dtype", "method", "known_patterns", "lease", "factor_slot", "matrix_slot", "worker", "drop_tolerance", "fill", "omega", "nodes", "part_bytes")
     HEADER_FIELD_NUMBER: _ClassVar[int]
     STEP_FIELD_NUMBER: _ClassVar[int]
     WARP_FIELD_NUMBER: _ClassVar[int]
@@ -163,6 +163,7 @@ class Matrix(_message.Message):
     FILL_FIELD_NUMBER: _ClassVar[int]
     OMEGA_FIELD_NUMBER: _ClassVar[int]
     NODES_FIELD_NUMBER: _ClassVar[int]
+    PART_BYTES_FIELD_NUMBER: _ClassVar[int]
     header: Header
     step: int
     warp: bool
@@ -179,7 +180,8 @@ class Matrix(_message.Message):
     fill: float
     omega: float
     nodes: int
-    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., step: _Optional[int] = ..., warp: _Optional[bool] = ..., blocks: _Optional[int] = ..., checksum: _Optional[int] = ..., factor_dtype: _Optional[str] = ..., method: _Optional[str] = ..., known_patterns: _Optional[_Iterable[int]] = ..., lease: _Optional[float] = ..., factor_slot: _Optional[_Union[Slot, _Mapping]] = ..., matrix_slot: _Optional[_Union[Slot, _Mapping]] = ..., worker: _Optional[str] = ..., drop_tolerance: _Optional[float] = ..., fill: _Optional[float] = ..., omega: _Optional[float] = ..., nodes: _Optional[int] = ...) -> None: ...
+    part_bytes: int
+    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., step: _Optional[int] = ..., warp: _Optional[bool] = ..., blocks: _Optional[int] = ..., checksum: _Optional[int] = ..., factor_dtype: _Optional[str] = ..., method: _Optional[str] = ..., known_patterns: _Optional[_Iterable[int]] = ..., lease: _Optional[float] = ..., factor_slot: _Optional[_Union[Slot, _Mapping]] = ..., matrix_slot: _Optional[_Union[Slot, _Mapping]] = ..., worker: _Optional[str] = ..., drop_tolerance: _Optional[float] = ..., fill: _Optional[float] = ..., omega: _Optional[float] = ..., nodes: _Optional[int] = ..., part_bytes: _Optional[int] = ...) -> None: ...
 
 class FactorPattern(_message.Message):
     __slots__ = ("header", "id", "size", "supernodes", "nonzeros", "permutation", "super_start", "row_start", "rows")
@@ -204,7 +206,7 @@ class FactorPattern(_message.Message):
     def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., id: _Optional[int] = ..., size: _Optional[int] = ..., supernodes: _Optional[int] = ..., nonzeros: _Optional[int] = ..., permutation: _Optional[bytes] = ..., super_start: _Optional[bytes] = ..., row_start: _Optional[bytes] = ..., rows: _Optional[bytes] = ...) -> None: ...
 
 class Factor(_message.Message):
-    __slots__ = ("header", "step", "warp", "pattern", "dtype", "nonzeros", "checksum", "slot", "worker", "seconds", "failure", "job", "matrix_shared", "remedy")
+    __slots__ = ("header", "step", "warp", "pattern", "dtype", "nonzeros", "checksum", "slot", "worker", "seconds", "failure", "job", "matrix_shared", "remedy", "parts")
     HEADER_FIELD_NUMBER: _ClassVar[int]
     STEP_FIELD_NUMBER: _ClassVar[int]
     WARP_FIELD_NUMBER: _ClassVar[int]
@@ -219,6 +221,7 @@ class Factor(_message.Message):
     JOB_FIELD_NUMBER: _ClassVar[int]
     MATRIX_SHARED_FIELD_NUMBER: _ClassVar[int]
     REMEDY_FIELD_NUMBER: _ClassVar[int]
+    PARTS_FIELD_NUMBER: _ClassVar[int]
     header: Header
     step: int
     warp: bool
@@ -233,7 +236,20 @@ class Factor(_message.Message):
     job: int
     matrix_shared: bool
     remedy: str
-    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., step: _Optional[int] = ..., warp: _Optional[bool] = ..., pattern: _Optional[int] = ..., dtype: _Optional[str] = ..., nonzeros: _Optional[int] = ..., checksum: _Optional[int] = ..., slot: _Optional[_Union[Slot, _Mapping]] = ..., worker: _Optional[str] = ..., seconds: _Optional[float] = ..., failure: _Optional[str] = ..., job: _Optional[int] = ..., matrix_shared: _Optional[bool] = ..., remedy: _Optional[str] = ...) -> None: ...
+    parts: _containers.RepeatedScalarFieldContainer[int]
+    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., step: _Optional[int] = ..., warp: _Optional[bool] = ..., pattern: _Optional[int] = ..., dtype: _Optional[str] = ..., nonzeros: _Optional[int] = ..., checksum: _Optional[int] = ..., slot: _Optional[_Union[Slot, _Mapping]] = ..., worker: _Optional[str] = ..., seconds: _Optional[float] = ..., failure: _Optional[str] = ..., job: _Optional[int] = ..., matrix_shared: _Optional[bool] = ..., remedy: _Optional[str] = ..., parts: _Optional[_Iterable[int]] = ...) -> None: ...
+
+class FactorPart(_message.Message):
+    __slots__ = ("header", "job", "number", "slot")
+    HEADER_FIELD_NUMBER: _ClassVar[int]
+    JOB_FIELD_NUMBER: _ClassVar[int]
+    NUMBER_FIELD_NUMBER: _ClassVar[int]
+    SLOT_FIELD_NUMBER: _ClassVar[int]
+    header: Header
+    job: int
+    number: int
+    slot: Slot
+    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., job: _Optional[int] = ..., number: _Optional[int] = ..., slot: _Optional[_Union[Slot, _Mapping]] = ...) -> None: ...
 
 class MatrixBatch(_message.Message):
     __slots__ = ("header", "worker", "factor_dtype", "method", "drop_tolerance", "fill", "omega", "matrix_slot", "factor_slot", "objects", "epochs", "jobs", "steps", "warps", "blocks", "checksums", "rooms", "leases", "known", "known_patterns")
@@ -370,7 +386,7 @@ class Echo(_message.Message):
     def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., slot: _Optional[_Union[Slot, _Mapping]] = ..., nonce: _Optional[int] = ..., settled: _Optional[bool] = ...) -> None: ...
 
 class ObjectStep(_message.Message):
-    __slots__ = ("header", "step", "time", "iterations", "residual", "status", "factor_step", "factor_age", "preconditioner", "assemble_seconds", "solve_seconds", "integrate_seconds", "step_seconds", "late_seconds", "cpu_seconds", "fallbacks", "excess", "interactions", "asked", "probe", "factor_age_bound", "linearizations", "nonlinear_residual", "kinetic_energy", "elastic_energy", "gravity_energy", "work", "dissipated", "form", "estimate", "contacts", "passes", "clipped", "contact_residual", "substeps", "halvings", "stable_step", "solve_error", "step_error", "readings", "reactions")
+    __slots__ = ("header", "step", "time", "iterations", "residual", "status", "factor_step", "factor_age", "preconditioner", "assemble_seconds", "solve_seconds", "integrate_seconds", "step_seconds", "late_seconds", "cpu_seconds", "fallbacks", "excess", "interactions", "asked", "probe", "factor_age_bound", "linearizations", "nonlinear_residual", "kinetic_energy", "elastic_energy", "gravity_energy", "work", "dissipated", "form", "estimate", "contacts", "passes", "clipped", "contact_residual", "substeps", "halvings", "at_rest", "stable_step", "solve_error", "step_error", "readings", "reactions")
     HEADER_FIELD_NUMBER: _ClassVar[int]
     STEP_FIELD_NUMBER: _ClassVar[int]
     TIME_FIELD_NUMBER: _ClassVar[int]
@@ -407,6 +423,7 @@ class ObjectStep(_message.Message):
     CONTACT_RESIDUAL_FIELD_NUMBER: _ClassVar[int]
     SUBSTEPS_FIELD_NUMBER: _ClassVar[int]
     HALVINGS_FIELD_NUMBER: _ClassVar[int]
+    AT_REST_FIELD_NUMBER: _ClassVar[int]
     STABLE_STEP_FIELD_NUMBER: _ClassVar[int]
     SOLVE_ERROR_FIELD_NUMBER: _ClassVar[int]
     STEP_ERROR_FIELD_NUMBER: _ClassVar[int]
@@ -448,12 +465,13 @@ class ObjectStep(_message.Message):
     contact_residual: float
     substeps: int
     halvings: int
+    at_rest: bool
     stable_step: float
     solve_error: float
     step_error: float
     readings: _containers.RepeatedCompositeFieldContainer[Reading]
     reactions: _containers.RepeatedCompositeFieldContainer[Reaction]
-    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., step: _Optional[int] = ..., time: _Optional[float] = ..., iterations: _Optional[int] = ..., residual: _Optional[float] = ..., status: _Optional[_Union[SolveStatus, str]] = ..., factor_step: _Optional[int] = ..., factor_age: _Optional[int] = ..., preconditioner: _Optional[str] = ..., assemble_seconds: _Optional[float] = ..., solve_seconds: _Optional[float] = ..., integrate_seconds: _Optional[float] = ..., step_seconds: _Optional[float] = ..., late_seconds: _Optional[float] = ..., cpu_seconds: _Optional[float] = ..., fallbacks: _Optional[int] = ..., excess: _Optional[float] = ..., interactions: _Optional[_Iterable[_Union[Interaction, _Mapping]]] = ..., asked: _Optional[str] = ..., probe: _Optional[int] = ..., factor_age_bound: _Optional[int] = ..., linearizations: _Optional[int] = ..., nonlinear_residual: _Optional[float] = ..., kinetic_energy: _Optional[float] = ..., elastic_energy: _Optional[float] = ..., gravity_energy: _Optional[float] = ..., work: _Optional[float] = ..., dissipated: _Optional[float] = ..., form: _Optional[_Union[StepForm, str]] = ..., estimate: _Optional[float] = ..., contacts: _Optional[int] = ..., passes: _Optional[int] = ..., clipped: _Optional[int] = ..., contact_residual: _Optional[float] = ..., substeps: _Optional[int] = ..., halvings: _Optional[int] = ..., stable_step: _Optional[float] = ..., solve_error: _Optional[float] = ..., step_error: _Optional[float] = ..., readings: _Optional[_Iterable[_Union[Reading, _Mapping]]] = ..., reactions: _Optional[_Iterable[_Union[Reaction, _Mapping]]] = ...) -> None: ...
+    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., step: _Optional[int] = ..., time: _Optional[float] = ..., iterations: _Optional[int] = ..., residual: _Optional[float] = ..., status: _Optional[_Union[SolveStatus, str]] = ..., factor_step: _Optional[int] = ..., factor_age: _Optional[int] = ..., preconditioner: _Optional[str] = ..., assemble_seconds: _Optional[float] = ..., solve_seconds: _Optional[float] = ..., integrate_seconds: _Optional[float] = ..., step_seconds: _Optional[float] = ..., late_seconds: _Optional[float] = ..., cpu_seconds: _Optional[float] = ..., fallbacks: _Optional[int] = ..., excess: _Optional[float] = ..., interactions: _Optional[_Iterable[_Union[Interaction, _Mapping]]] = ..., asked: _Optional[str] = ..., probe: _Optional[int] = ..., factor_age_bound: _Optional[int] = ..., linearizations: _Optional[int] = ..., nonlinear_residual: _Optional[float] = ..., kinetic_energy: _Optional[float] = ..., elastic_energy: _Optional[float] = ..., gravity_energy: _Optional[float] = ..., work: _Optional[float] = ..., dissipated: _Optional[float] = ..., form: _Optional[_Union[StepForm, str]] = ..., estimate: _Optional[float] = ..., contacts: _Optional[int] = ..., passes: _Optional[int] = ..., clipped: _Optional[int] = ..., contact_residual: _Optional[float] = ..., substeps: _Optional[int] = ..., halvings: _Optional[int] = ..., at_rest: _Optional[bool] = ..., stable_step: _Optional[float] = ..., solve_error: _Optional[float] = ..., step_error: _Optional[float] = ..., readings: _Optional[_Iterable[_Union[Reading, _Mapping]]] = ..., reactions: _Optional[_Iterable[_Union[Reaction, _Mapping]]] = ...) -> None: ...
 
 class Steps(_message.Message):
     __slots__ = ("header", "steps", "moves", "left_out")

@@ -47,6 +47,11 @@ def status_name(value: int) -> str:
     return enum_name("status", value)
 
 
+def ended(step: pb.ObjectStep) -> str:
+    """Says how the solve of a step ended: the name of its status, or that the object is at rest."""
+    return "at rest" if step.at_rest and step.status == pb.CONVERGED else status_name(step.status)
+
+
 def enum_name(field: str, value: int) -> str:
     """Names a value of an enumerated scalar, as `status_name` does."""
     return ENUMS[field].get(value, f"unknown_{value}")

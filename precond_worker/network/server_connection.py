@@ -13,6 +13,7 @@ import zenoh
 
 from precond_worker.errors import NameTaken
 from precond_worker.network.heartbeat import Heartbeat
+from precond_worker.network.offered_factors import OfferedFactors
 from precond_worker.network.presence import Presence, ServerGone, ServersThere
 from precond_worker.network.receive_queue import ReceiveQueue
 from precond_worker.network.retry import Retry
@@ -59,6 +60,7 @@ class ServerConnection:
         own = key("alive_worker", server, worker=name)
         self._claim(zs, own)
         # Subscribed first, announced last: the server sends as soon as it knows the token.
+        self.offered = OfferedFactors(session, server, name, counters)
         self._matrices = zs.declare_subscriber(key("matrix", server, worker=name), self.received.put)
         self._batches = zs.declare_subscriber(key("matrices", server, worker=name), self.received.put)
         self._token = zs.liveliness().declare_token(own)
@@ -117,6 +119,7 @@ class ServerConnection:
     def _beat(self) -> None:
         self._presence.look()
         self._say()
+        self.offered.expire()
 
     def _shared_memory_works(self, incarnation: int) -> bool:
         slots = SlotMap()
@@ -217,6 +220,8 @@ class ServerConnection:
         """Closes, and takes back what it has declared, where the session goes on without it."""
         self.close()
         self._presence.end()
+        with contextlib.suppress(zenoh.ZError):
+            self.offered.close()
         for declared in (self._token, self._matrices, self._batches, self._others):
             with contextlib.suppress(zenoh.ZError):
                 declared.undeclare()

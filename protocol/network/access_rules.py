@@ -92,6 +92,8 @@ def _worker(name: str, servers: Sequence[str]) -> list[dict[str, Any]]:
         _rule(["declare_subscriber"], ["ingress"], [key("need", "*")]),
         _rule(["put"], ["egress"], [key("need", "*")]),
         _rule(["query"], ["ingress"], keys("topology", "scene", "echo")),
+        _rule(["query"], ["egress"], keys("part")),
+        _rule(["declare_queryable", "reply"], ["ingress"], keys("part")),
         _rule(["liveliness_token"], ["ingress", "egress"], keys("alive_worker")),
         _rule(["liveliness_query"], ["ingress"], keys("alive_worker")),
     ]
@@ -102,7 +104,7 @@ def _own(channel: str, server: str, own: str, verb: str = "*") -> str:
     mark = "-own-"
     names = {"command": {"verb": verb, "client": mark}, "alive_client": {"client": mark}}.get(channel)
     if names is None:
-        of_workers = ("matrix", "matrices", "pattern", "factor", "factors", "worker", "echo", "alive_worker")
+        of_workers = ("matrix", "matrices", "pattern", "factor", "factors", "part", "worker", "echo", "alive_worker")
         names = {"worker": mark} if channel in of_workers else {}
     return key(channel, server, **names).replace(mark, own)
 

@@ -168,6 +168,11 @@ class SlotPool:
             slot.returned = self._returns
             self._free.setdefault(slot.capacity, deque()).append(slot)
 
+    def discard(self, slot: Slot) -> None:
+        """Takes back a slot that its borrower may still write to: it is not lent again, its memory is freed."""
+        if self._lent.pop(id(slot), None) is not None:
+            self._live.discard(slot)
+
     def _make(self, capacity: int) -> Slot | None:
         while not self._fits(capacity) and (unused := [slots for slots in self._free.values() if slots]):
             oldest = min(unused, key=lambda slots: slots[0].returned)

@@ -87,6 +87,7 @@ class KernelText:
     """
 
     def __init__(self, path: str, types: dict[str, str]):
+        self.path = path
         self.name, self.text = read_text(path)
         self.types, self.folder = types, folder_outside(path)
 

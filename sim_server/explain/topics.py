@@ -92,7 +92,7 @@ def topics(simulation: Simulation, server: str) -> dict[str, Topics]:
 def _always(simulation: Simulation, server: str) -> set[str]:
     """Keys that a server subscribes to or answers, whatever its scene."""
     wanted = simulation.scene.solver.wants_factors
-    of_workers = [name for name, c in CHANNELS.items() if c.sender == "worker" and name != "echo"]
+    of_workers = [name for name, c in CHANNELS.items() if c.sender == "worker" and name not in ("echo", "part")]
     names = (*QUERYABLES, "alive_server", "alive_client", *(of_workers if wanted else ()))
     return {key(name, server) for name in names}
 

@@ -77,12 +77,13 @@ struct HyperelasticEnergy {
     local* energy;           // (n,) out: V W [J]; NaN where the law is not defined
 };
 
+// In single precision terms as I1 - 3 and ln J, which nearly cancel, would leave a stiff element the rounding of its moduli.
 KERNEL(energy, HyperelasticEnergy) {
     index tet[4];
-    Tetrahedron<local_number> t = element_at(p, i, tet);
-    local_number c[CONSTANTS], floor = at_items(p.floor, i);
+    Tetrahedron<exact_number> t = element_at<exact_number>(p, i, tet);
+    exact_number c[CONSTANTS], floor = at_items(p.floor, i);
     constants_at(p, i, c);
-    local_number W = density(c, invariants<HAS>(mul(t.F, transposed(t.F)), t.J), floor);
-    if constexpr (REFUSES) W = t.J <= 0 && floor == 0 ? no_number<local_number>() : W;
-    put(p.energy, i, at_items(p.volume, i) * W);
+    exact_number W = density(c, invariants<HAS>(mul(t.F, transposed(t.F)), t.J), floor);
+    if constexpr (REFUSES) W = t.J <= 0 && floor == 0 ? no_number<exact_number>() : W;
+    put(p.energy, i, (local_number)(at_items(p.volume, i) * W));
 }

@@ -46,21 +46,21 @@ template <class T> INLINE Tetrahedron<T> tetrahedron(const vec<T> (&edges)[3], c
 }
 
 // Edges from corner 0 of a nodal field, their differences in the field's precision.
-INLINE void field_edges(const real* field, const index (&tet)[4], local_vec3 (&edges)[3]) {
+template <class T> INLINE void field_edges(const real* field, const index (&tet)[4], vec<T> (&edges)[3]) {
     vec3 u = load3(field, tet[0]);
-    UNROLL for (int k = 0; k < 3; ++k) edges[k] = as<local_number>(load3(field, tet[k + 1]) - u);
+    UNROLL for (int k = 0; k < 3; ++k) edges[k] = as<T>(load3(field, tet[k + 1]) - u);
 }
 
 // Element i of a kernel's parameters as it stands now; tet: its nodes.
-template <class P> INLINE Tetrahedron<local_number> element_at(const P& p, index i, index (&tet)[4]) {
+template <class T = local_number, class P> INLINE Tetrahedron<T> element_at(const P& p, index i, index (&tet)[4]) {
     get_item_row(p.tets, i, tet);
-    local_vec3 edges[3];
+    vec<T> edges[3];
     field_edges(p.x, tet, edges);
     return tetrahedron(edges, p.gradients, p.n, i);
 }
 
 // Its constants of the law, (N, n) one after another.
-template <int N, class P> INLINE void constants_at(const P& p, index i, local_number (&c)[N]) {
+template <int N, class P, class T> INLINE void constants_at(const P& p, index i, T (&c)[N]) {
     for (int k = 0; k < N; ++k) c[k] = at_items(p.constants + k * p.n, i);
 }
 

@@ -113,13 +113,13 @@ struct HyperelasticPatchEnergy {
     local* energy;           // (n,) out: V W_s [J]; NaN where the law is not defined
 };
 
-KERNEL(energy, HyperelasticPatchEnergy) {
+KERNEL(energy, HyperelasticPatchEnergy) {  // exact_number: as that of hyperelastic.cu
     index tet[4];
-    Tetrahedron<local_number> t = element_at(p, i, tet);
-    local_number c[CONSTANTS], floor = at_items(p.floor, i), volume = at_items(p.volume, i);
+    Tetrahedron<exact_number> t = element_at<exact_number>(p, i, tet);
+    exact_number c[CONSTANTS], floor = at_items(p.floor, i), volume = at_items(p.volume, i);
     constants_at(p, i, c);
-    local_number W = density(c, invariants<HAS>(mul(t.F, transposed(t.F)), t.J), floor);
-    if constexpr (REFUSES) W = t.J <= 0 && floor == 0 ? no_number<local_number>() : W;
-    put(p.energy, i, volume * W);
-    put(p.dilatation, i, volume * (t.J - 1));
+    exact_number W = density(c, invariants<HAS>(mul(t.F, transposed(t.F)), t.J), floor);
+    if constexpr (REFUSES) W = t.J <= 0 && floor == 0 ? no_number<exact_number>() : W;
+    put(p.energy, i, (local_number)(volume * W));
+    put(p.dilatation, i, (local_number)(volume * (t.J - 1)));
 }

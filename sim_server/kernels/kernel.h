@@ -36,6 +36,7 @@
 #define UNROLL _Pragma("unroll")
 typedef real number;
 typedef local local_number;
+typedef double exact_number;  // of small differences of large terms, whatever the precision
 typedef int index;
 constexpr int LANES = 1;
 template <class T> using entry = T;  // one of the scalars in a number
@@ -180,6 +181,7 @@ INLINE void mark(int* a, index i, bool mask) { if (mask) a[i] = 1; }
 
 #endif
 typedef number local_number;
+typedef number exact_number;
 #endif
 
 #if !defined(WIDE) || defined(__CUDACC_RTC__)

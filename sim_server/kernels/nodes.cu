@@ -40,6 +40,7 @@ struct Rotate {
     int whole;                 // 0: leave out the block of A
     local* rotation;           // (n, 3, 3) out: frame of the node: its rotation from rest to now, or the identity
     real* b_material;          // (n, 3) out: R^T b, 0 at fixed nodes
+    real* last_b;              // (n, 3) in, out: the same of the evaluation before, which no solve changes
     real* y;                   // (n, 3) out: start of the solve: R^T dv; R^T (-v) where the node rests; 0 at fixed nodes
     int* moving;               // (bodies,) out: set to 1 if a node of the body does not rest
     real* values;              // (blocks, 3, 3) out: R^T A R of the node's own block; the identity's at fixed nodes [kg]
@@ -67,19 +68,27 @@ INLINE local_mat3 frame_of(const Rotate& p, index i) {
     return rotation_matrix(q);
 }
 
-// A node rests if it moves in a step by less than the rounding error of its position, and b there is less than SAFETY times the
-// rounding error of the forces on it: its own stiffness times the errors of positions (of x) and of strains (of the body's extent).
-// At rest b is 0.1 of that bound. A node at rest is not solved for: the step sets its velocity to zero.
-template <class T> constexpr entry<T> EPSILON = sizeof(entry<T>) == 8 ? (entry<T>)2.2e-16 : (entry<T>)1.2e-7;
+// A node rests if a solve with the present forces has left it where it is: if
+//   - it moves in a step by less than the rounding error of its position,
+//   - b there is less than SAFETY times the rounding error of the forces on it: its own stiffness times the errors of positions (of
+//     x) and of strains (of the body's extent); at rest b is 0.1 of that bound, and
+//   - b is what it was one evaluation ago, within what velocities below that error change it by; where nothing moves, within the
+//     rounding of double precision.
+// Size alone does not tell rounding from a load, which may be small at each node and large for the body (a nearly incompressible bar
+// under its weight, a slender one under a push): a load that is new is solved for, however small.
+// A node at rest is not solved for: the step sets its velocity to zero.
+constexpr real SINGLE = (real)1.2e-7, DOUBLE = (real)2.2e-16;
+template <class T> constexpr real EPSILON = sizeof(entry<T>) == 8 ? DOUBLE : SINGLE;
 constexpr int SAFETY = 4;
 
 INLINE number largest(vec3 a) { return larger(larger(magnitude(a.x), magnitude(a.y)), magnitude(a.z)); }
 
 INLINE auto rests(const Rotate& p, index i, vec3 b, vec3 v, number stiffness) {
-    number from = largest(load3(p.x, i)), extent = at(p.extent, i);
-    number place = EPSILON<number> * (from + extent), strain = EPSILON<local_number> * extent;
-    number rounding = SAFETY * stiffness * at(p.inverse_time, i) * larger(place, strain);
-    return (largest(b) <= rounding) & (p.h * largest(v) <= place);
+    number extent = at(p.extent, i), from = largest(load3(p.x, i)) + extent, k = SAFETY * stiffness, per_time = at(p.inverse_time, i);
+    number place = EPSILON<number> * from, strain = EPSILON<local_number> * extent, speed = largest(v);
+    auto stood = p.h * larger(speed, largest(load3(p.dv, i))) <= DOUBLE * place;
+    number change = largest(b - load3(p.last_b, i)), allowed = k * (stood ? DOUBLE * from * per_time : place / p.h);
+    return (largest(b) <= k * per_time * larger(place, strain)) & (p.h * speed <= place) & (change <= allowed);
 }
 
 KERNEL(rotate, Rotate) {
@@ -94,6 +103,7 @@ KERNEL(rotate, Rotate) {
     auto still = fixed | rests(p, i, b, v, (number)((k[0] + k[3] + k[5]) / 3));
     vec3 y = select(fixed, zero, mul(Rt, select(still, -v, load3(p.dv, i))));
     put_row(p.b_material, i, p.n, {b.x, b.y, b.z});
+    put_row(p.last_b, i, p.n, {b.x, b.y, b.z});
     put_row(p.y, i, p.n, {y.x, y.y, y.z});
     mark(p.moving, at(p.body, i), !still);
 

@@ -102,7 +102,7 @@ class System:
         self.extent = extents[self.body]
         self._inverse_times: dict[float, Float64] = {}  # by world.dx_dv
         self.rotation = np.tile(np.eye(3), (n, 1, 1))
-        self.b_material = np.zeros((n, 3))
+        self.b_material, self.last_b = np.zeros((n, 3)), np.zeros((n, 3))
         self.y = np.zeros((n, 3))
         self.dv = np.zeros((n, 3))
         self.clock = np.zeros(1)
@@ -146,7 +146,8 @@ class System:
             "rotate", w.nodes, free=w.free, body=self.body, warped=self.warped, place=self.own,
             mean=self.mean, b=self.b, diagonal=self.diagonal, block=self.block, dv=self.dv,
             x=w.x, v=velocity, extent=self.extent, inverse_time=self.inverse_time, h=w.dt, whole=int(matrix),
-            moving=self.moving, rotation=self.rotation, b_material=self.b_material, y=self.y, values=self.values,
+            moving=self.moving, rotation=self.rotation, b_material=self.b_material, last_b=self.last_b, y=self.y,
+            values=self.values,
         )  # fmt: skip
         kept = self.keep_directions(frames=True)
         if not matrix:

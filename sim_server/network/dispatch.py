@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import zenoh
 
-from protocol.channels import CHANNELS, MOST_JOBS, key, name_in
+from protocol.channels import CHANNELS, MOST_JOBS, PART_BYTES, WHOLE_PARTS, key, name_in
 from protocol.counters import Counters
 from protocol.factor import Factor, FactorPattern
 from protocol.messages_pb2 import Factor as FactorMessage
@@ -23,6 +23,7 @@ from protocol.shared_memory.pool import Slot, SlotPool
 from protocol.validate import take
 from sim_server.network.batch_message import MOST_TOGETHER, Entry, batch_message, entries_of, group
 from sim_server.network.factor_decoder import AnnouncedObject, FactorDecoder
+from sim_server.network.factor_fetch import AHEAD, FactorFetch
 from sim_server.network.inbox import Inbox
 from sim_server.network.job_message import add_values, matrix_message
 from sim_server.network.leases import MAX_EXPIRED, InFlightJob, Leases
@@ -43,14 +44,17 @@ QUEUE_SECONDS = 0.02  # s of factorizations that wait at a worker at most
 LOOK_PERIOD = 1e-3  # s between looks at which leases are over
 MAX_SENT = 4096  # times of jobs that are remembered
 LARGE = 4 << 20  # bytes of a factor whose copy and checks take more than a few milliseconds
+SLOT_SHARE = 4  # a larger part of all shared memory than a SLOT_SHARE-th is not lent for one factor: it goes in parts
+FETCHES = 2  # factors that arrive in parts at a time, each in memory of its own
 SLOT_MARGIN = 8  # the slot for an incomplete factor is larger than the largest factor so far by a SLOT_MARGIN-th
 
 
 class Decoding(NamedTuple):
-    """A factor that is decoded beside the caller.
+    """A factor that is taken in beside the caller.
 
-    future: it is decoded once that is done, and `take` returns the factor, or raises Refused
+    future: that is over once it is done, and `take` returns the factor, or raises Refused
     seconds, by_slot, duration: as of Dispatch._take_factor
+    fetch: of its parts, if it comes in parts
     """
 
     job: InFlightJob
@@ -59,6 +63,7 @@ class Decoding(NamedTuple):
     seconds: float
     by_slot: tuple[bool, bool]
     duration: float | None = None
+    fetch: FactorFetch | None = None
 
 
 class Dispatch(FactorSource):
@@ -95,7 +100,9 @@ class Dispatch(FactorSource):
         self._answered_at: dict[str, float] = {}  # likewise, of the answers with a factor
         self._fast_links: set[str] = set()  # workers without shared memory whose link takes a job at once
         self._thread = ThreadPoolExecutor(1, "large factors")
+        self._fetching = ThreadPoolExecutor(FETCHES, "parts of factors")
         self._decoding: dict[int, Decoding] = {}  # by number of the job
+        self._fetches: set[int] = set()  # of these, the jobs whose factors come in parts
         self._factors: list[Factor] = []
         self._failures: list[tuple[str, str]] = []
         self._patterns: list[tuple[str, FactorPattern]] = []
@@ -185,7 +192,9 @@ class Dispatch(FactorSource):
     def reassigned(self) -> list[str]:
         """Objects whose job was taken from a slow worker since another one is idle; they may be submitted again."""
         with self._lock:
-            slow = self.leases.reassign(self._clock(), self._has_candidates)
+            slow = self.leases.reassign(
+                self._clock(), lambda job: not self._is_decoded(job) and self._has_candidates(job)
+            )
             self._counters.add("passed_on", len(slow))
             return [job.object for job in slow]
 
@@ -338,7 +347,9 @@ class Dispatch(FactorSource):
     def _submit_to(self, worker: str, job: Job) -> bool:
         """Sends a job alone."""
         matrix_slot, factor_slot = self._allocate_slots(worker, job)
-        lease = self.leases.lease(job.object, worker, job.method.name, job.positions)
+        lease = self.leases.lease(
+            job.object, worker, job.method.name, job.positions, self.decoder.objects[job.object].blocks
+        )
         slots = tuple(slot for slot in (matrix_slot, factor_slot) if slot is not None)
         payload_bytes = 0 if matrix_slot else job.values.nbytes
         in_flight = self._begin_job(job, worker, lease, slots, factor_slot=factor_slot, payload_bytes=payload_bytes)
@@ -369,6 +380,7 @@ class Dispatch(FactorSource):
             exclusive_until=now + self.leases.exclusive_period(job.object, self.decoder.objects[job.object].blocks),
             method=job.method.name,
             positions=job.positions,
+            part_bytes=PART_BYTES,
             **more,
         )
         self.leases.start(in_flight)
@@ -395,7 +407,12 @@ class Dispatch(FactorSource):
         if info is not None and info.shared_memory and seconds is not None and small:
             most = MOST_JOBS if info.batches and self.decoder.most_are_sized else MOST_ALONE
             most = max(1, min(info.most_jobs, most, int(QUEUE_SECONDS / max(seconds, 1e-6))))
-        return max(0, most - self.leases.count(worker))
+        return max(0, most - self._waiting(worker))
+
+    def _waiting(self, worker: str) -> int:
+        """Number of jobs that a worker has not done yet; those whose parts are fetched are done."""
+        fetched = sum(self._decoding[number].job.worker == worker for number in self._fetches)
+        return self.leases.count(worker) - fetched
 
     def _candidates(self, idle: list[str], available: list[str], object: str) -> list[str]:
         """Idle workers that are not suspended for the object; all idle ones if all available workers are."""
@@ -422,7 +439,7 @@ class Dispatch(FactorSource):
             return idle[0]
 
         def rank(name: str) -> tuple[int, float, int, bool, int]:
-            info, waiting = self._registry.info(name), self.leases.count(name)
+            info, waiting = self._registry.info(name), self._waiting(name)
             waiting += 0 if rooms is None else self._room(name) - rooms[name]
             expired, expected = self.leases.expired_count(name), self._timing.expected(name, object)
             other = self._last_worker.get(object) != name
@@ -437,9 +454,12 @@ class Dispatch(FactorSource):
         nonzeros = self.decoder.objects[job.object].largest.get(job.method.name, 0)
         if job.method.name == "incomplete_cholesky":
             nonzeros += nonzeros // SLOT_MARGIN  # the next factor may keep more blocks
+        size = nonzeros * np.dtype(job.dtype).itemsize
+        if size > max(WHOLE_PARTS * PART_BYTES, self._pool.limit // SLOT_SHARE):
+            size = 0  # it comes in parts
         matrix = self._pool.lend(job.values.nbytes)
-        factor = self._pool.lend(nonzeros * np.dtype(job.dtype).itemsize) if nonzeros else None
-        if matrix is None or (nonzeros and factor is None):
+        factor = self._pool.lend(size) if size else None
+        if matrix is None or (size and factor is None):
             self._counters.trouble("slots_exhausted", "no slot of shared memory is left, an array travels as bytes")
         return matrix, factor
 
@@ -497,7 +517,7 @@ class Dispatch(FactorSource):
         if len(self._sent) > MAX_SENT:
             flying = {job.number for job in self.leases.jobs}
             self._sent = {number: when for number, when in self._sent.items() if number in flying}
-        for job in self.leases.expire(now):
+        for job in self.leases.expire(now, self._is_decoded):
             self._counters.add("leases_over")
             self._on_expired(job, "was not answered within its lease")
         for job in self.leases.expire_undelivered(self._sent_at, self._registry.idle_period):
@@ -561,10 +581,11 @@ class Dispatch(FactorSource):
         self._reliability.on_answer(job.worker)
         if self.leases.is_reassigned(job):
             return self.leases.finish(job, None if message.failure else message.seconds)
+        if message.parts and not message.failure:
+            return self._fetch(message, job)
         decode = partial(self.decoder.decode, message, sample.payload, job)
         if not message.failure and 4 * message.nonzeros > LARGE:  # its bytes are copied and checked beside the caller
-            if job.number in self._decoding:
-                raise Refused(f"Factor.job is {job.number}, already answered", "duplicate")
+            self._refuse_second(job)
             future = self._thread.submit(decode)
             made = Decoding(job, future, future.result, message.seconds, _slots_used(message))
             self._decoding[job.number] = made
@@ -604,11 +625,53 @@ class Dispatch(FactorSource):
                 take, by_slot = partial(_result, future, k), (message.matrix_shared, True)
                 self._decoding[job.number] = Decoding(job, future, take, message.seconds[place], by_slot, duration)
 
+    def _fetch(self, message: FactorMessage, job: InFlightJob) -> None:
+        """Begins to fetch a factor in parts, beside the caller. Its worker is free for the jobs of other objects."""
+        self._refuse_second(job)
+        info, slots = self._registry.info(job.worker), []
+        if self._pool is not None and info is not None and info.shared_memory:
+            slots = [slot for slot in (self._pool.lend(job.part_bytes) for _ in range(AHEAD)) if slot is not None]
+            if len(slots) < AHEAD:
+                self._give_back(slots)
+                slots = []
+        fetch = FactorFetch(
+            self._session, self._server, self._incarnation, self._counters, job, message.nonzeros, message.parts, slots
+        )
+        decode = partial(self.decoder.decode, message, b"", job, fetch.run)
+        future, by_slot = self._fetching.submit(decode), (message.matrix_shared, bool(slots))
+        made = Decoding(job, future, future.result, message.seconds, by_slot, fetch=fetch)
+        self._decoding[job.number] = made
+        self._fetches.add(job.number)
+
+    def _give_back(self, slots: Sequence[Slot], clean: bool = True) -> None:
+        """Frees the slots of a fetch. clean: nobody writes to them any more."""
+        if self._pool is not None:
+            for slot in slots:
+                (self._pool.give_back if clean else self._pool.discard)(slot)
+
+    def _refuse_second(self, job: InFlightJob) -> None:
+        if self._is_decoded(job):
+            raise Refused(f"Factor.job is {job.number}, already answered", "duplicate")
+
+    def _is_decoded(self, job: InFlightJob) -> bool:
+        """True while the answer to a job is taken in beside the caller."""
+        return job.number in self._decoding
+
     def _take_decoded(self) -> None:
         """Takes the large factors that were decoded beside the caller, unless their jobs are over."""
+        for number in self._fetches:
+            job, fetch = self._decoding[number].job, self._decoding[number].fetch
+            if fetch is not None and self.leases.by_object.get(job.object) is not job:
+                fetch.gone.set()
         for number in [number for number, each in self._decoding.items() if each.future.done()]:
             each = self._decoding.pop(number)
-            job = each.job
+            self._fetches.discard(number)
+            job, fetch = each.job, each.fetch
+            if fetch is not None:
+                self._give_back(fetch.slots, fetch.clean)
+                if fetch.gone.is_set():  # why its job is over was told
+                    self._end_gone(job)
+                    continue
             try:
                 current = self.leases.match_answer(job.number, job.worker, job.epoch)
                 if self.leases.is_reassigned(current):
@@ -617,6 +680,11 @@ class Dispatch(FactorSource):
                     self._take_factor(current, each.take, "", each.seconds, each.by_slot, each.duration)
             except Refused as refusal:
                 self._counters.refuse(refusal)
+
+    def _end_gone(self, job: InFlightJob) -> None:
+        """Frees the worker of a job that is over, if it is still there."""
+        if self.leases.by_worker.get(job.worker, {}).get(job.number) is job:
+            self.leases.finish(job)
 
     def _take_factor(
         self, job: InFlightJob, decode: Callable[[], Factor], failure: str, told: float, by_slot: tuple[bool, bool],

@@ -2,7 +2,7 @@
 """Checks and decodes what workers send: patterns of L, and factors as bytes or in a slot of shared memory."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -95,8 +95,11 @@ class FactorDecoder:
             raise Refused(f"Factor.seconds is {message.seconds}; allowed: 0 or more", "malformed")
         return message
 
-    def decode(self, message: FactorMessage, payload: Sized, job: InFlightJob) -> Factor:
-        """Returns the factor that answers a job."""
+    def decode(
+        self, message: FactorMessage, payload: Sized, job: InFlightJob,
+        fetch: Callable[[], Float32 | Float64] | None = None,
+    ) -> Factor:  # fmt: skip
+        """Returns the factor that answers a job. fetch: returns values that are in parts, each with its checksum."""
         for name, value, wanted in (
             ("header.object", message.header.object, job.object),
             ("step", message.step, job.step),
@@ -110,6 +113,8 @@ class FactorDecoder:
             raise Refused(f"Factor.pattern is {message.pattern:016x}, which was not sent before", "pattern")
         if message.nonzeros != pattern.nonzeros:
             raise Refused(f"Factor.nonzeros is {message.nonzeros}; allowed: {pattern.nonzeros}", "shape")
+        if fetch is not None:
+            return self._factor(pattern, fetch(), None, job, message.seconds, message.remedy)
         in_slot = message.HasField("slot")
         values = _from_slot(message.slot, message.nonzeros, job) if in_slot else _from_payload(message, payload)
         return self._factor(pattern, values, message.checksum, job, message.seconds, message.remedy)
@@ -157,8 +162,8 @@ class FactorDecoder:
         return made
 
     def _factor(
-        self, pattern: FactorPattern, values: Float32 | Float64, checksum: int, job: InFlightJob, seconds: float,
-        remedy: str,
+        self, pattern: FactorPattern, values: Float32 | Float64, checksum: int | None, job: InFlightJob,
+        seconds: float, remedy: str,
     ) -> Factor:  # fmt: skip
         check_values(values, pattern, checksum)
         largest = self.objects[job.object].largest

@@ -38,6 +38,7 @@ def matrix_message(job: InFlightJob, known: AnnouncedObject, incarnation: int, l
         known_patterns=list(known.patterns),
         lease=lease,
         worker=job.worker,
+        part_bytes=job.part_bytes,
     )
     if job.factor_slot is not None:
         message.factor_slot.CopyFrom(job.factor_slot.message())

@@ -13,6 +13,7 @@ from protocol.shared_memory.pool import Slot
 
 MIN_LEASE = 2.0  # s
 MAX_LEASE = 120.0  # s; also for the first job of an object at a worker, which may compile, import and analyse for it
+LEASE_BLOCKS = 500_000  # of a matrix, above which the longest lease grows as the operations of a factor, blocks^2
 MAX_DOUBLINGS = 8  # of a lease
 LEASE_FACTOR = 20  # a lease is this multiple of the duration of the last factorization
 EXCLUSIVE_PER_BLOCK = 1e-4  # s per block of the matrix: exclusive period of an object without any factor yet
@@ -41,6 +42,7 @@ class InFlightJob:
     room: bytes of the factor slot that are for this job, from `first` on
     payload_bytes: size of the values if they are in no slot
     positions: they are positions, from which the worker assembles the matrix
+    part_bytes: of each part of a factor that travels in parts
     """
 
     number: int
@@ -61,6 +63,7 @@ class InFlightJob:
     method: str = "cholesky"
     payload_bytes: int = 0
     positions: bool = False
+    part_bytes: int = 0
 
 
 class Leases:
@@ -87,17 +90,20 @@ class Leases:
         self._last += 1
         return self._last
 
-    def lease(self, object: str, worker: str, method: str = "cholesky", positions: bool = False) -> float:
+    def lease(
+        self, object: str, worker: str, method: str = "cholesky", positions: bool = False, blocks: int = 0
+    ) -> float:
         """Time [s] that the worker has for its answer; doubled after each job that expired.
 
-        MAX_LEASE for the first job of an object by a method, and the first that it assembles itself: it may import and
-        compile for that.
+        The longest there is, MAX_LEASE and more for large matrices, for the first job of an object by a method, and the
+        first that it assembles itself: it may import and compile for that.
         """
+        longest = MAX_LEASE * max(1.0, (blocks / LEASE_BLOCKS) ** 2)
         known = self._seconds.get(object, {}).get(worker)
         if known is None or (method, positions) not in self._answered.get((object, worker), ()):
-            return MAX_LEASE
+            return longest
         doublings = self._doublings.get((object, worker), 0)
-        return float(min(MAX_LEASE, max(MIN_LEASE, LEASE_FACTOR * known) * 2**doublings))
+        return float(min(longest, max(MIN_LEASE, LEASE_FACTOR * known) * 2**doublings))
 
     def exclusive_period(self, object: str, blocks: int) -> float:
         """Time [s] in which no other worker is asked for the object, by the duration at its fastest known worker."""
@@ -187,9 +193,12 @@ class Leases:
             self._answered.setdefault((job.object, job.worker), set()).add((job.method, job.positions))
             self._doublings.pop((job.object, job.worker), None)
 
-    def expire(self, now: float) -> list[InFlightJob]:
-        """Ends the leases that are over: objects and workers are free again, the slots are not. Returns the jobs."""
-        return self._expire([job for job in self.jobs if now > job.deadline])
+    def expire(self, now: float, is_answered: Callable[[InFlightJob], bool] = lambda job: False) -> list[InFlightJob]:
+        """Ends the leases that are over: objects and workers are free again, the slots are not. Returns the jobs.
+
+        is_answered: the answer is there, and is taken in
+        """
+        return self._expire([job for job in self.jobs if now > job.deadline and not is_answered(job)])
 
     def expire_undelivered(
         self, sent_at: Callable[[InFlightJob], float], idle: Callable[[str], tuple[float, float] | None]

@@ -7,6 +7,7 @@ native code writes beside the launches is listed by the engine (`state` in backe
 """
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -25,6 +26,7 @@ DERIVED = frozenset({
 TOTALS = frozenset({  # counted or first times of a run, or what factors have to know: no reset takes it back
     "refused", "dropped", "left_before", "changed_at", "at_rest", "copied_at",
 })  # fmt: skip
+ADDED = frozenset({"last_b"})  # since there are checkpoints; those without them go on all the same
 
 
 def state_arrays(simulation: Simulation) -> list[StateArray]:
@@ -44,7 +46,8 @@ def launch_arrays(simulation: Simulation) -> list[StateArray]:
                 continue
             name = _unused(f"{launch.name}.{member}", {each.name for each in found.values()})
             resets = member not in TOTALS and id(array) not in moved
-            found[id(array)] = _array(simulation, name, array, launch, resets)
+            state = _array(simulation, name, array, launch, resets)
+            found[id(array)] = replace(state, added=member in ADDED)
     w = simulation.world
     others: dict[str, NDArray[Any]] = {"world.free": w.free, "world.reaction": w.reaction}
     if simulation.touch is not None:

@@ -6,12 +6,13 @@ import re
 import pytest
 
 from clients.log import scalars
-from protocol.channels import CHANNELS, PROTOCOL, Channel
+from protocol.channels import CHANNELS, PART_BYTES, PROTOCOL, WHOLE_PARTS, Channel
+from protocol.factor import MOST_VALUES
 from protocol.push_limits import LONGEST_PUSH
 from protocol.shared_memory import limits
 from sim_server import cli
 from sim_server.mesh import MOST_TETS, skin
-from sim_server.network import command_queue, leases, rate_limiter, worker_registry
+from sim_server.network import command_queue, factor_fetch, leases, rate_limiter, worker_registry
 from sim_server.recording import recorder
 from sim_server.scene import integrator_options, where
 from sim_server.service import commands, supervisor
@@ -80,7 +81,13 @@ def test_channels() -> None:
         ("use.md", f"above {recorder.FRAME_BYTES >> 20} MiB"),
         ("use.md", f"above {recorder.TOTAL_BYTES >> 20} MiB all records"),
         ("use.md", f"up to {cli.WORKER_TIMEOUT:g} s"),
-        ("gpu.md", f"{CHANNELS['factor'].bulk >> 30} GiB"),
+        ("gpu.md", f"An L of more than {MOST_VALUES:,} values"),
+        ("../README.md", f"A factor of more than {MOST_VALUES:,} values"),
+        ("protocol.md", f"more than {WHOLE_PARTS * PART_BYTES >> 20} MiB that has no slot"),
+        ("protocol.md", f"parts, {PART_BYTES >> 20} MiB each"),
+        ("protocol.md", f"asked for three times, {factor_fetch.QUESTION_TIME:g} s each"),
+        ("protocol.md", f"The most is {MOST_VALUES:,} values"),
+        ("protocol.md", f"above {leases.LEASE_BLOCKS:,} of them"),
         ("scenes.md", f"is at most {integrator_options.MAX_STATES}"),
     ],
 )

@@ -2,7 +2,7 @@
 """What a hard case is: a scene, what is done to it, and what must hold."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
 
@@ -49,7 +49,8 @@ class Case:
     upright: det F > 0 in every element at the end. refused: the model does not define the state: every solve ends with
     not_finite, an element is named, nothing moves, and put back to rest the body goes on. fails: known not to hold all
     of this; the statuses must tell. iterations: largest allowed mean over the steps with a factor.
-    seed: of running.seeded. saddle: where it goes is decided by rounding, so that other seeds may end elsewhere.
+    seed: of running.seeded. several: the law has several stable equilibria, and rounding decides to which one it comes.
+    easy, easy_start: overrides and start that make it easy, for what the case costs; None: it has no cost of its own.
     note: what must be known to read the line; where something does not hold, why.
     """
 
@@ -72,8 +73,15 @@ class Case:
     fails: bool = False
     iterations: float = 0
     seed: int = 0
-    saddle: bool = False
+    several: bool = False
+    easy: tuple[str, ...] | None = (GRAVITY,)
+    easy_start: Start = nothing
     note: str = ""
+
+    def twin(self) -> "Case":
+        """The same bar made easy: ordinary material and step, nothing done to it."""
+        given = {"scene": self.easy or (), "start": self.easy_start, "hold": None, "source": None, "build": None}
+        return replace(self, seed=0, refused=False, **given)
 
     def must_hold(self) -> str:
         """In words, from the same numbers that are asserted."""

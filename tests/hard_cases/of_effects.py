@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from sim_server.scene.model import Scene
 from sim_server.simulation import Simulation
 from sim_server.updates.driver import Driver
-from tests.hard_cases.running import STATUS, quiet
+from tests.hard_cases.running import STATUS, Beside, quiet
 
 Table = dict[str, Any]
 Reals = NDArray[np.float64]
@@ -46,6 +46,7 @@ class EffectCase:
     scene: made from random numbers; begin: changes the state before the first step; act: before each one
     judge: what must be at most `most`; unconverged: how many steps may end so, by status, of all objects
     fails: known not to hold all of this, for the reason of the note
+    easy: its scene made easy, for what the case costs; None: the scene itself, without `begin` and `act`, if it has any
     """
 
     name: str
@@ -60,12 +61,13 @@ class EffectCase:
     unconverged: dict[str, int] = field(default_factory=dict)
     fails: bool = False
     note: str = ""
+    easy: Callable[[Random], Table] | None = None
 
 
 @dataclass(frozen=True)
 class EffectOutcome:
     """Of one seed. wrong: what had to hold and did not; volume: least and largest V / V0 of an object; lowest: smallest
-    det F; residual: the largest true one of a step that says converged"""
+    det F; residual: the largest true one of a step that says converged; cost: as of running.Outcome"""
 
     wrong: tuple[str, ...]
     value: float
@@ -74,24 +76,25 @@ class EffectOutcome:
     volume: tuple[float, float] = (1.0, 1.0)
     lowest: float = 1.0
     residual: float = 0.0
+    cost: tuple[float, float] | None = None
 
 
 def run_effect_case(
     case: EffectCase, seed: int, device: str = "cpu", precision: str = "float64",
-    watch: Callable[[Simulation], None] = quiet,
+    watch: Callable[[Simulation], None] = quiet, compare: bool = False,
 ) -> EffectOutcome:  # fmt: skip
-    """watch: called before the first step and after each."""
+    """watch: called before the first step and after each; compare: with the scene made easy, step by step beside it."""
     random = np.random.default_rng(seed)
-    table = {"name": "case", "dt": 0.01, **case.scene(random)}
-    usual = {"preconditioner": "cholesky", "update": "lockstep-5", "precision": precision}
-    table["solver"] = usual | table.get("solver", {})
-    sim = Simulation(Scene.model_validate(table, context={"folder": "."}), device)
+    sim = _built(case.scene(random), device, precision)
+    easy = _easy(case, seed, device, precision) if compare else None
     case.begin(sim, random)
     driver, start, positions, records = Driver(sim), sim.fetch().x.copy(), [], []
     watch(sim)
     for step in range(case.steps):
         case.act(sim, step)
         records.append(driver.advance(1))
+        if easy:
+            easy.step()
         positions.append(sim.fetch().x.copy())
         watch(sim)
     trace = Trace(start, positions, np.concatenate(records))
@@ -107,8 +110,21 @@ def run_effect_case(
     solved = trace.records["residual"][trace.records["status"] == 0]
     return EffectOutcome(
         tuple(wrong), value, status, trace.records["iterations"].astype(float), *_shape(sim, trace),
-        float(solved.max(initial=0.0)),
+        float(solved.max(initial=0.0)), easy.cost(records) if easy else None,
     )  # fmt: skip
+
+
+def _built(table: Table, device: str, precision: str) -> Simulation:
+    table = {"name": "case", "dt": 0.01, **table}
+    usual = {"preconditioner": "cholesky", "update": "lockstep-5", "precision": precision}
+    table["solver"] = usual | table.get("solver", {})
+    return Simulation(Scene.model_validate(table, context={"folder": "."}), device)
+
+
+def _easy(case: EffectCase, seed: int, device: str, precision: str) -> Beside | None:
+    done = any(getattr(case, name) is not EffectCase.__dataclass_fields__[name].default for name in ("act", "begin"))
+    scene = case.easy or (case.scene if done else None)
+    return Beside(_built(scene(np.random.default_rng(seed)), device, precision)) if scene else None
 
 
 def _shape(sim: Simulation, trace: Trace) -> tuple[tuple[float, float], float]:

@@ -42,6 +42,9 @@ def pulled(times: float) -> list[Table]:
     return [{"time": 0}, {"time": 1, **away}, {"time": 1.5, **away}, {"time": 2.5}]
 
 
+STILL: list[Table] = [{"time": 0}, {"time": 1}]
+
+
 def turned(turns: int) -> list[Table]:
     """So many turns about the bar in 2 s, held for 0.5 s, and back in 2 s."""
     there = [{"time": 2 * k / (4 * turns), "rotate": [90.0 * k, 0, 0]} for k in range(4 * turns + 1)]
@@ -155,6 +158,7 @@ RECIPES = [
         back_to_rest,
         1e-3,
         450,
+        easy=lambda r: held_at_the_end(STABLE, STILL, r),
     ),
     *(
         EffectCase(
@@ -167,6 +171,7 @@ RECIPES = [
             650,
             fails=turns > 4,
             note=KNOTTED if turns > 4 else "",
+            easy=lambda r, law=law: held_at_the_end(law, STILL, r),
         )
         for turns in (4, 10)
         for name, law in (
@@ -183,6 +188,7 @@ RECIPES = [
         1e-3,
         300,
         unconverged={"contact": 60},
+        easy=on_the_floor,
     ),
     EffectCase(
         "poked with 1000 N",
@@ -216,6 +222,7 @@ RECIPES = [
             1.0,
             300,
             unconverged={"max_linearizations": 300},
+            easy=lambda r, law=law, n=linearizations: column(r, law, 0.1, {"linearizations": n}),
         )
         for name, law in LAWS.items()
         for times, linearizations in ((2, 1), (8, 1), (8, 10))

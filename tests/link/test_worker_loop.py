@@ -17,6 +17,7 @@ from precond_worker.worker import Worker
 from protocol.channels import PROTOCOL, key
 from protocol.counters import Counters
 from protocol.factor import FactorPattern
+from protocol.factor_parts import bytes_of, part_checksums
 from protocol.messages_pb2 import Factor, Header, Matrix, Scene, Topology
 from protocol.method import Method
 from protocol.refused import Refused
@@ -54,6 +55,23 @@ class Diagonal:
         return np.sqrt(diagonal).astype(dtype)
 
 
+class FakeOffers:
+    """Factors that are kept to be asked for."""
+
+    def __init__(self) -> None:
+        self.kept: dict[str, tuple[int, np.ndarray]] = {}
+
+    def offer(self, object: str, header: Header, job: int, values: np.ndarray, part_bytes: int) -> list[int]:
+        self.kept[object] = job, values
+        return part_checksums(bytes_of(values), part_bytes)
+
+    def withdraw(self, object: str) -> None:
+        self.kept.pop(object, None)
+
+    def clear(self) -> None:
+        self.kept.clear()
+
+
 class FakeConnection:
     """The network as the worker sees it; answers and patterns pile up here."""
 
@@ -62,6 +80,7 @@ class FakeConnection:
         self.counters = Counters(logging.getLogger("test"))
         self.received: ReceiveQueue[Any] = ReceiveQueue(8)
         self.slots = SlotMap()
+        self.offered = FakeOffers()
         self.answers: list[tuple[Factor, bytes]] = []
         self.patterns: list[tuple[str, int]] = []
         self.asked: list[tuple[str, int]] = []
@@ -377,6 +396,31 @@ def test_a_device_that_fails_ends_the_worker_after_an_answer(connection: FakeCon
     with pytest.raises(DeviceUnusable):
         drain(worker, connection, matrix(1))
     assert [answer.failure for answer, _ in connection.answers] == ["the GPU failed: cudaErrorIllegalAddress"]
+
+
+def test_a_large_factor_is_kept_to_be_asked_for_in_parts(worker: Worker, connection: FakeConnection) -> None:
+    """Six values of four bytes: parts of 4 bytes are six, of 8 bytes three, and up to four travel whole."""
+    drain(worker, connection, matrix(part_bytes=4))
+    answer, payload = connection.answers[0]
+    job, values = connection.offered.kept["beam"]
+    assert (job, payload, answer.checksum) == (1, b"", 0)
+    assert list(answer.parts) == [checksum(value.tobytes()) for value in values] and len(values) == 6
+    drain(worker, connection, matrix(2, scale=9.0, part_bytes=8))
+    answer, payload = connection.answers[1]
+    assert list(answer.parts) == [] and np.array_equal(np.frombuffer(payload, np.float32), np.full(6, 3.0, np.float32))
+    assert connection.offered.kept == {}, "the server has had the one before, or has given it up"
+
+
+def test_an_older_server_has_every_factor_whole(worker: Worker, connection: FakeConnection) -> None:
+    drain(worker, connection, matrix())
+    assert not connection.answers[0][0].parts and len(connection.answers[0][1]) == 24
+
+
+def test_factors_of_a_server_that_is_gone_are_dropped(worker: Worker, connection: FakeConnection) -> None:
+    drain(worker, connection, matrix(part_bytes=4))
+    connection.received.put(ServerGone(7))
+    worker.step(0.0)
+    assert connection.offered.kept == {}
 
 
 @pytest.mark.parametrize(

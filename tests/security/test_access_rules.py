@@ -96,6 +96,9 @@ def test_a_client_looks_and_is_no_worker(name: str) -> None:
     ):
         assert not allowed(name, "put", "ingress", f"sim/{key}") and not allowed(name, "put", "egress", f"sim/{key}")
     assert not allowed(name, "query", "ingress", f"sim/echo/{name}.w")
+    for message in ("query", "declare_queryable", "reply"):
+        assert not allowed(name, message, "ingress", "sim/part/mill.w")
+        assert not allowed(name, message, "ingress", f"sim/part/{name}.w")
 
 
 def test_a_worker_has_the_jobs_under_its_own_names() -> None:
@@ -105,12 +108,17 @@ def test_a_worker_has_the_jobs_under_its_own_names() -> None:
     assert allowed("mill", "put", "egress", "sim/matrix/mill.w1/beam")
     assert allowed("mill", "declare_subscriber", "ingress", "*/need") and allowed("mill", "put", "egress", "sim/need")
     assert allowed("mill", "query", "ingress", "sim/echo/mill.w1")
+    assert allowed("mill", "query", "egress", "sim/part/mill.w1")
+    assert allowed("mill", "declare_queryable", "ingress", "sim/part/mill.w1")
+    assert allowed("mill", "reply", "ingress", "sim/part/mill.w1")
     assert allowed("mill", "liveliness_token", "ingress", "sim/alive/worker/mill.w1")
     for name in ("other.w1", "mill", "w1", "*"):
         assert not allowed("mill", "declare_subscriber", "ingress", f"sim/matrix/{name}/*")
         assert not allowed("mill", "put", "egress", f"sim/matrix/{name}/beam")
         for channel in ("worker/{}", "factor/{}/beam", "pattern/{}/beam"):
             assert not allowed("mill", "put", "ingress", f"sim/{channel.format(name)}")
+        for message in ("declare_queryable", "reply", "query"):
+            assert not allowed("mill", message, "ingress", f"sim/part/{name}")
         assert not allowed("mill", "liveliness_token", "ingress", f"sim/alive/worker/{name}")
         assert not allowed("mill", "liveliness_token", "ingress", f"sim/alive/client/{name}")
 

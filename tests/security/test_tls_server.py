@@ -2,10 +2,13 @@
 """A real server with certificates: what each role may, whose grab is whose, and what who is refused is told."""
 
 import datetime
+import logging
 import shutil
+import threading
 from collections.abc import Iterator
 from pathlib import Path
 
+import numpy as np
 import pytest
 import zenoh
 from cryptography import x509
@@ -13,14 +16,20 @@ from cryptography.hazmat.primitives import hashes, serialization
 
 from clients.client import Client
 from clients.errors import BadInput, ClientError
+from precond_worker.network.server_connection import ServerConnection
+from precond_worker.worker import Worker
 from protocol import messages_pb2 as pb
 from protocol.access.client_name import new_client
 from protocol.channels import PROTOCOL, key
+from protocol.counters import Counters
 from protocol.network.identity import identity_of
 from protocol.network.session import open_session
 from sim_server.certificates.in_use import Certificates
 from sim_server.errors import InputError
-from tests.system.link_helpers import free_endpoint
+from sim_server.network import dispatch
+from sim_server.network.factor_fetch import FactorFetch
+from sim_server.network.link import ServerLink
+from tests.system.link_helpers import DenseAnalysis, Driver, chain, dense, free_endpoint, matrix, product
 from tests.system.server_process import PATIENCE, Stage, beam, run, until
 
 pytestmark = pytest.mark.system
@@ -235,6 +244,46 @@ def test_certificates_of_others_do_not_serve(stage: TlsStage, name: str) -> None
     with pytest.raises(InputError, match=f"{stage.certs / 'operator'}: is missing"):
         used(str(stage.certs), web=True)
     shutil.move(stage.certs / "elsewhere", stage.certs / "operator")
+
+
+def test_parts_of_a_factor_pass_the_rules(stage: TlsStage, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(dispatch, "PART_BYTES", 64)
+    where, topology, ended = free_endpoint().replace("tcp/", "tls/"), chain(), threading.Event()
+    with (
+        ServerLink(listen=[where], shared_memory=False, tls=identity_of(stage.certs, ("server",))) as link,
+        open_session("client", connect=[where], shared_memory=False, tls=identity_of(stage.certs / "worker", ())) as to,
+        ServerConnection(to, "sim", "worker.w", 1, "dense", Counters(logging.getLogger("worker"))) as connection,
+    ):
+        worker = Worker(connection, DenseAnalysis)
+
+        def work() -> None:
+            while not ended.is_set():
+                worker.step(0.05)
+
+        thread = threading.Thread(target=work)
+        thread.start()
+        try:
+            link.announce(topology)
+            fetches = counted_fetches(monkeypatch)
+            factor = Driver(link).factor(topology, 1)
+        finally:
+            ended.set()
+            thread.join()
+        assert np.allclose(product(factor), dense(topology, matrix(topology)), atol=1e-5)
+        assert fetches == [19], "it came in parts"
+
+
+def counted_fetches(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """Numbers of parts of the factors that are fetched from now on."""
+    found: list[int] = []
+    run_fetch = FactorFetch.run
+
+    def noted(fetch: FactorFetch) -> object:
+        found.append(len(fetch._parts))
+        return run_fetch(fetch)
+
+    monkeypatch.setattr(FactorFetch, "run", noted)
+    return found
 
 
 def test_a_worker_cannot_pose_as_the_server(stage: TlsStage) -> None:

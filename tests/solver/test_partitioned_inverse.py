@@ -15,7 +15,11 @@ from protocol.factor import FactorPattern
 from sim_server.backends.gpu.inverse.expansion_batches import workspace_layout
 from sim_server.backends.gpu.inverse.partition import tree_of
 from sim_server.backends.gpu.inverse.plan import FORM, GATHER, READ, WRITE, Plan, lay_out, plan
+from sim_server.simulation import Simulation
+from sim_server.updates.driver import Driver
+from tests.hard_cases.case import BAR, GRAVITY
 from tests.reference.partitioned import Application, by_tasks, stored
+from tests.reference.pcg import pcg
 from tests.reference.supernodal import columns
 from tests.scenes import bar, factor_of, simulation
 from tests.worker.block_matrices import bar_edges, dense_matrix, pattern, spd
@@ -90,6 +94,28 @@ def test_it_solves_the_system_of_a_step():
         assert p.groups == groups and p.phases == 2 * groups - 1
         assert error(s, p, np.float64) < 1e-12
         assert error(s, p, np.float16) < 5e-3  # its condition number is about 100
+
+
+HARD = {
+    "stiff and soft side by side": 'young=[{ where = "X < 0.5", young = 1e10 }, { young = 1e4 }]',
+    "nearly incompressible": "poisson=0.4999",
+}
+
+
+@pytest.mark.parametrize("law", HARD.values(), ids=HARD.keys())
+def test_what_11_binary_digits_do_not_bear_22_do(law):
+    """Solves of a step by CG with the factor of its own matrix, stored as a GPU does."""
+    mesh = "object.bar.mesh={ bar = [2, 2, 8], size = [1, 1, 4] }"
+    sim = Simulation.load(BAR, [GRAVITY, mesh, f"object.bar.effects.corotational.{law}"])
+    Driver(sim).advance(20)
+    sim.engine.assemble()
+    (pattern_, factor), b = factor_of(sim, dtype=np.float32), sim.system.b_material.ravel()
+    iterations = []
+    for planes in (1, 2):
+        p = plan(pattern_, 16, planes=planes)
+        apply = Application(p, *stored(pattern_, factor, p, np.float16))
+        iterations.append(len(pcg(sim.matrix(), b, apply, 1e-6, 200)) - 1)
+    assert iterations[1] <= 3 and iterations[0] > 3 * iterations[1], iterations
 
 
 def test_the_operator_is_symmetric_and_positive_also_in_float16():

@@ -96,8 +96,8 @@ while [ "$1" != -o ]; do shift; done
 exec g++ -shared -x c++ /dev/null -o "$2"
 """
 NEEDED = (  # of the creature: other texts become empty libraries, so that the wheel is made in seconds
-    "sim_server/backends/cpu/native", "precond_worker/", "effects/corotational", "effects/rayleigh.cu",
-    "effects/touch.cu", "effects/gravity.cu", "kernels/nodes.cu", "kernels/rotate_blocks.cu",
+    "sim_server/backends/cpu/native", "sim_server/recording/", "precond_worker/", "effects/corotational",
+    "effects/rayleigh.cu", "effects/touch.cu", "effects/gravity.cu", "kernels/nodes.cu", "kernels/rotate_blocks.cu",
 )  # fmt: skip
 
 

@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from html import escape
 
-from clients.log.scalars import status_name
+from clients.log.scalars import ended
 from protocol import messages_pb2 as pb
 
 MOST = 30  # objects that are listed
@@ -36,7 +36,7 @@ def tables(status: pb.Status) -> str:
         ("object", "nodes", "iterations", "residual", "age", "status"),
         (
             (o.object, o.nodes, f"{o.mean_iterations:.1f}", f"{o.last.residual:.1e}", _age(o.factor_age),
-             status_name(o.last.status))
+             ended(o.last))
             for o in status.objects[:MOST]
         ),
     )  # fmt: skip

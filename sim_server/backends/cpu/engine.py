@@ -84,6 +84,9 @@ class NativePattern:
         return bool(self.native.plan)
 
 
+KEPT = 16 << 20  # bytes of a factor above which its values are kept instead of copied
+
+
 class NativeFactor:
     """A factor in memory that native code can apply: to the given values, which are not copied."""
 
@@ -107,9 +110,10 @@ class NativeFactor:
         return c.addressof(self.native)
 
     def fill(self, values: NDArray[Any], step: int) -> None:
-        """Copies the values of L made from the matrix of `step`."""
-        if self._taken:  # the values are not ours to write to
-            self.take(values.copy(), step)
+        """Takes the values of L made from the matrix of `step`: copies them, or keeps those of a large factor, which
+        would fill the memory once more."""
+        if values.nbytes > KEPT or self._taken:  # those that were taken over are not ours to write to
+            self.take(values if values.nbytes > KEPT else values.copy(), step)
             return
         self.values[:] = values
         self.native.step = step
@@ -774,7 +778,7 @@ class CpuEngine(Reports):
     # --- mailboxes ----------------------------------------------------------------------------------------------
 
     def post_factor(self, body: int, pattern: FactorPattern, values: NDArray[Any], step: int) -> None:
-        """Copies a factor into a free buffer; the loop takes it up before its next solve of the body."""
+        """Puts a factor into a free buffer; the loop takes it up before its next solve of the body."""
         buffer = self._free_buffer(body, pattern, values.dtype)
         buffer.fill(values, step)
         self._mail[body].waiting = buffer

@@ -162,6 +162,7 @@ __device__ __forceinline__ void apply_to_body(const PcgArguments& s, const Stage
                                     {range.index, body.blocks, s.exchange_number[k], s.block_sums + 8ll * s.grid * k, s.grid, memory.scratch,
                                      memory.totals, (int)threadIdx.x % 32, (int)threadIdx.x / 32}};
         PcgResult out = no_solve(body);
+        out.at_rest = 0;
         double inconsistency;
         alone = solver.apply(t, pulled, out, inconsistency);
         if (decides) {

@@ -81,6 +81,7 @@ HOST_DEVICE void note_pass(ContactState& c, const ContactSolve& pass, int outcom
     sum.status = out.status;
     sum.bad_node = out.bad_node;
     sum.residual = out.residual;
+    sum.at_rest = out.at_rest;
 #ifdef ERRORS
     sum.solve_error = out.solve_error;
 #endif

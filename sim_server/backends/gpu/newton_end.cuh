@@ -68,6 +68,7 @@ __device__ __forceinline__ void write_results(const NewtonArguments& p, int body
     r.kind = s.kind;
     r.fallbacks = s.fallbacks;
     r.bad_node = bad;
+    r.at_rest = s.status == CONVERGED && s.iterations == 0 && s.residual > settings.tolerance;
     NewtonResult& told = p.newton_results[(p.step[0] % p.capacity) * p.count + body];
     told = {residual_ratio(s), s.linearizations > 1 ? s.linearizations : 1};
 #ifdef ERRORS

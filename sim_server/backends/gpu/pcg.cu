@@ -714,6 +714,7 @@ __device__ __forceinline__ void PcgSolver::solve() {
                 memory.b2 = bb;
                 if (memory.rests && bb > 0 && !refused) {  // b is rounding error: the solution stays as it is, the body rests
                     out.residual = sqrt(r2 / bb);
+                    out.at_rest = 1;
                     return;
                 }
                 memory.goal = body.tolerance * body.tolerance * bb;

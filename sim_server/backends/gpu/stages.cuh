@@ -58,9 +58,9 @@ DECIDES bool may_use_factor(const StageState& s, const PcgBody& body) {
     return step >= 0 && body.kind == CHOLESKY && step > s.spring_step && (s.patience == 0 || s.factor_step != step);
 }
 
-// Result of a step before its first solve.
+// Result of a step before its first solve; a body at rest has none.
 DECIDES PcgResult no_solve(const PcgBody& body) {
-    return {0, 0, body.kind == CHOLESKY ? factor_step_of(body) : -1, 0, CONVERGED, body.kind, body.kind, 0, -1, body.probe};
+    return {0, 0, body.kind == CHOLESKY ? factor_step_of(body) : -1, 0, CONVERGED, body.kind, body.kind, 0, -1, body.probe, 1};
 }
 
 // Adds a solve to the result of the step.
@@ -69,6 +69,7 @@ DECIDES void add_solve(PcgResult& sum, const PcgResult& r) {
     sum.iterations += r.iterations;
     sum.fallbacks += r.fallbacks;
     sum.kind = r.kind;
+    sum.at_rest = r.at_rest;
     if (!(r.residual <= sum.residual)) sum.residual = r.residual;
     if (r.factor_step >= 0) sum.factor_step = r.factor_step;
 #ifdef ERRORS

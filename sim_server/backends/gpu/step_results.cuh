@@ -7,6 +7,7 @@ struct PcgResult {
     double seconds;
     long long factor_step;  // -1: no factor used
     int iterations, status, kind, asked, fallbacks, bad_node, probe;
+    int at_rest;            // 1: the body rests, nothing was solved
     double solve_error;     // estimated, largest of a node [m]; 0: not known
 };
 

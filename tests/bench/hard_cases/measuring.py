@@ -93,7 +93,12 @@ def _measured(job: Job, device: str, folder: Path) -> Row:
         found = run_long(entry, 1000 if job.quick else entry.steps)
         return {"steps": 1000 if job.quick else entry.steps, "wrong": "; ".join(found.wrong(entry)), **vars(found)}
     case = of_precision(seeded(entry, job.seed), job.precision)
-    return _of_case(case, run_case(finer(case) if job.finer else case, folder, device, job.precision))
+    return _of_case(
+        case,
+        run_case(
+            finer(case) if job.finer else case, folder, device, job.precision, compare=job.seed == 0 and not job.finer
+        ),
+    )
 
 
 def _of_case(case: Case, out: Outcome) -> Row:
@@ -102,18 +107,19 @@ def _of_case(case: Case, out: Outcome) -> Row:
         "rise": out.rise, "dissipated": out.dissipated, "status": dict(out.status), "fallbacks": out.fallbacks,
         "iterations": float(out.iterations.mean()), "most_iterations": float(out.iterations.max()),
         "distance": out.distance, "recovered": out.recovered, "lowest": out.lowest, "upright": out.upright,
-        "volume": list(out.volume), "residual": out.residual, "curve": list(out.curve),
+        "volume": list(out.volume), "residual": out.residual, "curve": list(out.curve), "home": out.home,
+        "cost": out.cost and list(out.cost),
     }  # fmt: skip
 
 
 def _of_effect(case: EffectCase, job: Job, device: str) -> Row:
-    out = run_effect_case(case, job.seed, device, job.precision)
+    out = run_effect_case(case, job.seed, device, job.precision, compare=job.seed == 0)
     wrong = "; ".join(out.wrong)
     return {
         "wrong": wrong, "unexpected": ("" if wrong else "stated to fail, and it holds") if case.fails else wrong,
         "value": out.value, "status": dict(out.status), "iterations": float(out.iterations.mean()),
         "most_iterations": float(out.iterations.max()), "volume": list(out.volume), "lowest": out.lowest,
-        "residual": out.residual,
+        "residual": out.residual, "cost": out.cost and list(out.cost),
     }  # fmt: skip
 
 

@@ -88,8 +88,13 @@ def _solves(rows: list[Row]) -> Row:
     return {
         "status": status_of(rows), "residual": _number(_worst(rows, "residual"), ".0e"),
         "iterations mean / max": f"{_number(mean, '.1f')} / {_number(_worst(rows, 'most_iterations'), '.0f')}",
-        "V / V0": _volume(rows), "smallest J": _number(_worst(rows, "lowest", min), ".2g"),
+        "cost": _cost(rows), "V / V0": _volume(rows), "smallest J": _number(_worst(rows, "lowest", min), ".2g"),
     }  # fmt: skip
+
+
+def _cost(rows: list[Row]) -> str:
+    """Of the seed that was run beside the scene made easy."""
+    return next((f"{cost[0]:.1f} / {cost[1]:.1f}" for row in rows if (cost := row.get("cost"))), "–")
 
 
 def case_row(case: Case, found: Found, kind: str) -> Row:
@@ -102,6 +107,9 @@ def case_row(case: Case, found: Found, kind: str) -> Row:
     row |= {"energy": "0" if energy is not None and energy <= 1e-9 else _number(energy, ".1e"),
             "at dt / 10": _number(smaller[0] if smaller else None, ".1e")} | _solves(rows)  # fmt: skip
     row["back"] = "–" if case.rests in ("spin", "same") else "never" if None in back else str(max(back))
+    if case.several:
+        home = [each["home"] for each in rows if each.get("home") is not None]
+        row["back"] += f"; {sum(each <= case.within for each in home)} of {len(home)} straight"
     row["at the end / L"] = "–" if case.rests == "spin" else _number(_worst(rows, "distance"), ".0e")
     return row
 
@@ -167,7 +175,7 @@ def failures(found: Found) -> list[Row]:
             elsewhere = texts.ON_A_GPU.get(name, "")
             for text, where in wrong.items():
                 there = elsewhere if all(each.startswith("GPU") for each in where) else ""
-                known = getattr(case, "fails", False) or getattr(case, "saddle", False)
+                known = getattr(case, "fails", False) or getattr(case, "several", False)
                 why = there or getattr(case, "note", "") or "–"
                 row = {"case": f"**{name}**", "where": "; ".join(where), "what": text}
                 rows.append(row | {"known": "yes" if known else "no", "why": why})
@@ -296,6 +304,7 @@ def write_page(parts: list[Row], out: Path | None, quick: bool, report: Report |
     if found.names("long"):
         report.say(texts.LONG)
         report.table(long_rows(found))
+        report.say(notes(run for run in LONG_RUNS if run.name in found.names("long")))
     report.data["parts"] = parts
     cases = [row for kind in ("case", "effect", "model") for row in found.of(kind, place=("cpu", "float64"))]
     if cases:

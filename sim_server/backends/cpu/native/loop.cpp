@@ -283,6 +283,7 @@ static void finish_step(Loop* loop) {
         SolveResult r;
         if (loop->newton && (!loop->euler || is_made(*loop, i))) {
             r = as_solve_result(loop->newton->search[i]);
+            r.at_rest = !loop->moving[i] && r.status == CONVERGED && r.iterations == 0;
             linearizations = std::max(1, loop->newton->search[i].linearizations);
             nonlinear = residual_ratio(loop->newton->search[i]);
             step_error = loop->newton->search[i].step_error;

@@ -55,6 +55,7 @@ struct SolveResult {
     double solve_error = NAN;  // estimated, of the solution, largest of a node [m]; NaN: not known
     double factor_scale = 0;   // of P^-1 at the end: the estimate over dx_dv |P^-1 r|; 0: not known
     double start_scale = 0;    // the same of the start, by the change of x and the estimate; 0: not known
+    int32_t at_rest = 0;       // 1: the body rests, nothing was solved
 };
 
 // Where a solve starts: from zero or from x if that is better, as the settings say; or from x, whose residual is what the tolerance
@@ -145,7 +146,10 @@ static SolveResult pcg(const BlockCsr& A, const double* b, const Factor* factor,
     if (b2 == 0 || rests) out.solve_error = 0;
     if (b2 == 0) return finish(CONVERGED, 0, 0);
     double goal = settings.tolerance * settings.tolerance * b2;
-    if (rests) return finish(CONVERGED, residual(A, b, x, r), b2);
+    if (rests) {
+        out.at_rest = 1;
+        return finish(CONVERGED, residual(A, b, x, r), b2);
+    }
     double r2 = from == GIVEN_START ? b2 : settings.warm_start ? residual(A, b, x, r) : b2;  // 1. r = b - A x
     if (from != GIVEN_START && (!settings.warm_start || !(r2 < b2))) {
         zero();

@@ -48,6 +48,7 @@ struct Record {
     int32_t passes = 0;         // solves for them
     int32_t clipped = 0;        // nodes held back at an obstacle beside the law
     int32_t halvings = 0;       // the step was made again by 2^halvings short ones; 0: it was not
+    int32_t at_rest = 0;        // 1: nothing was solved, since b of a body at rest is rounding, as the residual is; it says converged
     int32_t substeps = 0;       // explicit ones of the step; 0: an implicit scheme
     double stable_step = NAN;   // largest stable substep as estimated last [s]; NaN: an implicit scheme
     double solve_error = NAN;   // estimated, of the positions, by the last linear solve, largest of a node [m]; NaN: not known
@@ -66,6 +67,7 @@ template <class B> static inline void note_energy(Record& record, const B& b) {
     if (b.phase != WELL && (rests || record.status != NOT_FINITE)) record.status = RUNAWAY;
     if (!rests) return;
     record.factor_step = -1;  // there was nothing to solve
+    record.at_rest = 0;
     record.kind = record.asked;
 }
 
@@ -141,6 +143,7 @@ static inline Record make_record(const Rings& rings, int64_t step, int32_t body,
     record.status = solve.status;
     record.kind = solve.kind;
     record.fallbacks = solve.fallbacks;
+    record.at_rest = solve.at_rest;
     return record;
 }
 

@@ -80,6 +80,7 @@ static void note(SolveResult& sum, const SolveResult& r) {
     sum.iterations += r.iterations;
     sum.fallbacks += r.fallbacks;
     sum.kind = r.kind;
+    sum.at_rest = r.at_rest;
     if (!(r.residual <= sum.residual)) sum.residual = r.residual;
     if (r.status != CONVERGED) sum.status = r.status;
     sum.solve_error = std::isnan(sum.solve_error) ? r.solve_error : sum.solve_error + r.solve_error;
@@ -174,7 +175,11 @@ template <class F> static void solve_stage(Loop& loop, bool first, F take_part) 
     each_body(loop, [&](int i) {
         StageState& s = loop.stages->state[i];
         if (!take_part(i) || s.form == FAILED) return;
-        if (!loop.moving[i] && s.form != EULER) { s.result.kind = loop.body[i].now.kind; return; }
+        if (!loop.moving[i] && s.form != EULER) {
+            s.result.kind = loop.body[i].now.kind;
+            s.result.at_rest = 1;
+            return;
+        }
         if (s.form != FACTOR) { iterate(loop, i, first); return; }
         if (apply_alone(loop, i, first)) return;
         s.patience = PATIENCE;
