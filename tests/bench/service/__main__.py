@@ -26,7 +26,7 @@ from tests.bench.service.paced import Served
 
 TITLE = "What the service thread takes in"
 SIZES = (64, 256, 512, 1024)
-FIRST = 60.0  # s until measuring begins, though not every beam has had a factor
+FIRST = 150.0  # s until measuring begins, though not every beam has had a factor
 KEYS = ("name", "objects", "begun")
 COLUMNS = ("name", "objects", "factors/s", "us a factor", "calls a factor", "factors a round", "busy", "steps/s",
            "age p50", "age p99", "age max")  # fmt: skip
