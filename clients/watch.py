@@ -54,7 +54,7 @@ def _summary(status: pb.Status) -> Text:
         f"step {status.step}, t = {status.time:.3f} s, dt = {status.dt * 1e3:g} ms",
         f"step p50 {_ms(status.step_p50)}, p99 {_ms(status.step_p99)}, max {_ms(status.step_max)}, "
         f"late {status.late_steps}; dropped: frames {status.frames_dropped}, step records {status.records_dropped}; "
-        f"lost to the log {status.records_lost}",
+        f"lost to the log {status.records_lost}, left out of it {status.records_thinned}",
         f"refused: messages {status.refused}, commands {status.commands_refused}; "
         f"arrays through shared memory {status.bulk_shared}, "
         f"as bytes {status.bulk_copied}; clients {len(status.clients)}",

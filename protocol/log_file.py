@@ -18,6 +18,7 @@ from protocol.log_chunks import BadLog, ChunkFile, NoFile
 from protocol.log_pieces import later_pieces
 
 CHUNKS = 8  # kept unpacked, about 1 MiB each
+KEPT_EVERY = 16  # steps: so many less one records of an object may be left out in a row where the log could not follow
 OPEN = 64  # pieces that stay open, so that they can be read though a recorder removes them; others while they are read
 
 

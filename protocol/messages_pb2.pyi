@@ -386,7 +386,7 @@ class Echo(_message.Message):
     def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., slot: _Optional[_Union[Slot, _Mapping]] = ..., nonce: _Optional[int] = ..., settled: _Optional[bool] = ...) -> None: ...
 
 class ObjectStep(_message.Message):
-    __slots__ = ("header", "step", "time", "iterations", "residual", "status", "factor_step", "factor_age", "preconditioner", "assemble_seconds", "solve_seconds", "integrate_seconds", "step_seconds", "late_seconds", "cpu_seconds", "fallbacks", "excess", "interactions", "asked", "probe", "factor_age_bound", "linearizations", "nonlinear_residual", "kinetic_energy", "elastic_energy", "gravity_energy", "work", "dissipated", "form", "estimate", "contacts", "passes", "clipped", "contact_residual", "substeps", "halvings", "at_rest", "stable_step", "solve_error", "step_error", "readings", "reactions")
+    __slots__ = ("header", "step", "time", "iterations", "residual", "status", "factor_step", "factor_age", "preconditioner", "assemble_seconds", "solve_seconds", "integrate_seconds", "step_seconds", "late_seconds", "cpu_seconds", "fallbacks", "excess", "interactions", "asked", "probe", "factor_age_bound", "linearizations", "nonlinear_residual", "kinetic_energy", "elastic_energy", "gravity_energy", "work", "dissipated", "form", "estimate", "contacts", "passes", "clipped", "contact_residual", "substeps", "halvings", "at_rest", "stable_step", "solve_error", "step_error", "readings", "left_out", "reactions")
     HEADER_FIELD_NUMBER: _ClassVar[int]
     STEP_FIELD_NUMBER: _ClassVar[int]
     TIME_FIELD_NUMBER: _ClassVar[int]
@@ -428,6 +428,7 @@ class ObjectStep(_message.Message):
     SOLVE_ERROR_FIELD_NUMBER: _ClassVar[int]
     STEP_ERROR_FIELD_NUMBER: _ClassVar[int]
     READINGS_FIELD_NUMBER: _ClassVar[int]
+    LEFT_OUT_FIELD_NUMBER: _ClassVar[int]
     REACTIONS_FIELD_NUMBER: _ClassVar[int]
     header: Header
     step: int
@@ -470,8 +471,9 @@ class ObjectStep(_message.Message):
     solve_error: float
     step_error: float
     readings: _containers.RepeatedCompositeFieldContainer[Reading]
+    left_out: int
     reactions: _containers.RepeatedCompositeFieldContainer[Reaction]
-    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., step: _Optional[int] = ..., time: _Optional[float] = ..., iterations: _Optional[int] = ..., residual: _Optional[float] = ..., status: _Optional[_Union[SolveStatus, str]] = ..., factor_step: _Optional[int] = ..., factor_age: _Optional[int] = ..., preconditioner: _Optional[str] = ..., assemble_seconds: _Optional[float] = ..., solve_seconds: _Optional[float] = ..., integrate_seconds: _Optional[float] = ..., step_seconds: _Optional[float] = ..., late_seconds: _Optional[float] = ..., cpu_seconds: _Optional[float] = ..., fallbacks: _Optional[int] = ..., excess: _Optional[float] = ..., interactions: _Optional[_Iterable[_Union[Interaction, _Mapping]]] = ..., asked: _Optional[str] = ..., probe: _Optional[int] = ..., factor_age_bound: _Optional[int] = ..., linearizations: _Optional[int] = ..., nonlinear_residual: _Optional[float] = ..., kinetic_energy: _Optional[float] = ..., elastic_energy: _Optional[float] = ..., gravity_energy: _Optional[float] = ..., work: _Optional[float] = ..., dissipated: _Optional[float] = ..., form: _Optional[_Union[StepForm, str]] = ..., estimate: _Optional[float] = ..., contacts: _Optional[int] = ..., passes: _Optional[int] = ..., clipped: _Optional[int] = ..., contact_residual: _Optional[float] = ..., substeps: _Optional[int] = ..., halvings: _Optional[int] = ..., at_rest: _Optional[bool] = ..., stable_step: _Optional[float] = ..., solve_error: _Optional[float] = ..., step_error: _Optional[float] = ..., readings: _Optional[_Iterable[_Union[Reading, _Mapping]]] = ..., reactions: _Optional[_Iterable[_Union[Reaction, _Mapping]]] = ...) -> None: ...
+    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., step: _Optional[int] = ..., time: _Optional[float] = ..., iterations: _Optional[int] = ..., residual: _Optional[float] = ..., status: _Optional[_Union[SolveStatus, str]] = ..., factor_step: _Optional[int] = ..., factor_age: _Optional[int] = ..., preconditioner: _Optional[str] = ..., assemble_seconds: _Optional[float] = ..., solve_seconds: _Optional[float] = ..., integrate_seconds: _Optional[float] = ..., step_seconds: _Optional[float] = ..., late_seconds: _Optional[float] = ..., cpu_seconds: _Optional[float] = ..., fallbacks: _Optional[int] = ..., excess: _Optional[float] = ..., interactions: _Optional[_Iterable[_Union[Interaction, _Mapping]]] = ..., asked: _Optional[str] = ..., probe: _Optional[int] = ..., factor_age_bound: _Optional[int] = ..., linearizations: _Optional[int] = ..., nonlinear_residual: _Optional[float] = ..., kinetic_energy: _Optional[float] = ..., elastic_energy: _Optional[float] = ..., gravity_energy: _Optional[float] = ..., work: _Optional[float] = ..., dissipated: _Optional[float] = ..., form: _Optional[_Union[StepForm, str]] = ..., estimate: _Optional[float] = ..., contacts: _Optional[int] = ..., passes: _Optional[int] = ..., clipped: _Optional[int] = ..., contact_residual: _Optional[float] = ..., substeps: _Optional[int] = ..., halvings: _Optional[int] = ..., at_rest: _Optional[bool] = ..., stable_step: _Optional[float] = ..., solve_error: _Optional[float] = ..., step_error: _Optional[float] = ..., readings: _Optional[_Iterable[_Union[Reading, _Mapping]]] = ..., left_out: _Optional[int] = ..., reactions: _Optional[_Iterable[_Union[Reaction, _Mapping]]] = ...) -> None: ...
 
 class Steps(_message.Message):
     __slots__ = ("header", "steps", "moves", "left_out")
@@ -896,7 +898,7 @@ class LocalWorker(_message.Message):
     def __init__(self, worker: _Optional[str] = ..., state: _Optional[str] = ..., pid: _Optional[int] = ..., restarts: _Optional[int] = ..., exit_code: _Optional[int] = ...) -> None: ...
 
 class Status(_message.Message):
-    __slots__ = ("header", "scene", "state", "step", "time", "dt", "step_p50", "step_p99", "step_max", "late_steps", "objects", "workers", "clients", "bulk_shared", "bulk_copied", "refused", "frames_dropped", "device", "pid", "uptime", "records_dropped", "records_lost", "recording_failure", "commands_refused", "moves_replaced", "bulk_bytes_out", "bulk_bytes_in", "local_workers", "obstacles", "pace")
+    __slots__ = ("header", "scene", "state", "step", "time", "dt", "step_p50", "step_p99", "step_max", "late_steps", "objects", "workers", "clients", "bulk_shared", "bulk_copied", "refused", "frames_dropped", "device", "pid", "uptime", "records_dropped", "records_thinned", "records_lost", "recording_failure", "commands_refused", "moves_replaced", "bulk_bytes_out", "bulk_bytes_in", "local_workers", "obstacles", "pace")
     HEADER_FIELD_NUMBER: _ClassVar[int]
     SCENE_FIELD_NUMBER: _ClassVar[int]
     STATE_FIELD_NUMBER: _ClassVar[int]
@@ -918,6 +920,7 @@ class Status(_message.Message):
     PID_FIELD_NUMBER: _ClassVar[int]
     UPTIME_FIELD_NUMBER: _ClassVar[int]
     RECORDS_DROPPED_FIELD_NUMBER: _ClassVar[int]
+    RECORDS_THINNED_FIELD_NUMBER: _ClassVar[int]
     RECORDS_LOST_FIELD_NUMBER: _ClassVar[int]
     RECORDING_FAILURE_FIELD_NUMBER: _ClassVar[int]
     COMMANDS_REFUSED_FIELD_NUMBER: _ClassVar[int]
@@ -948,6 +951,7 @@ class Status(_message.Message):
     pid: int
     uptime: float
     records_dropped: int
+    records_thinned: int
     records_lost: int
     recording_failure: str
     commands_refused: int
@@ -957,4 +961,4 @@ class Status(_message.Message):
     local_workers: _containers.RepeatedCompositeFieldContainer[LocalWorker]
     obstacles: _containers.RepeatedCompositeFieldContainer[ObstaclePose]
     pace: str
-    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., scene: _Optional[str] = ..., state: _Optional[str] = ..., step: _Optional[int] = ..., time: _Optional[float] = ..., dt: _Optional[float] = ..., step_p50: _Optional[float] = ..., step_p99: _Optional[float] = ..., step_max: _Optional[float] = ..., late_steps: _Optional[int] = ..., objects: _Optional[_Iterable[_Union[ObjectStatus, _Mapping]]] = ..., workers: _Optional[_Iterable[_Union[WorkerInfo, _Mapping]]] = ..., clients: _Optional[_Iterable[str]] = ..., bulk_shared: _Optional[int] = ..., bulk_copied: _Optional[int] = ..., refused: _Optional[int] = ..., frames_dropped: _Optional[int] = ..., device: _Optional[str] = ..., pid: _Optional[int] = ..., uptime: _Optional[float] = ..., records_dropped: _Optional[int] = ..., records_lost: _Optional[int] = ..., recording_failure: _Optional[str] = ..., commands_refused: _Optional[int] = ..., moves_replaced: _Optional[int] = ..., bulk_bytes_out: _Optional[int] = ..., bulk_bytes_in: _Optional[int] = ..., local_workers: _Optional[_Iterable[_Union[LocalWorker, _Mapping]]] = ..., obstacles: _Optional[_Iterable[_Union[ObstaclePose, _Mapping]]] = ..., pace: _Optional[str] = ...) -> None: ...
+    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., scene: _Optional[str] = ..., state: _Optional[str] = ..., step: _Optional[int] = ..., time: _Optional[float] = ..., dt: _Optional[float] = ..., step_p50: _Optional[float] = ..., step_p99: _Optional[float] = ..., step_max: _Optional[float] = ..., late_steps: _Optional[int] = ..., objects: _Optional[_Iterable[_Union[ObjectStatus, _Mapping]]] = ..., workers: _Optional[_Iterable[_Union[WorkerInfo, _Mapping]]] = ..., clients: _Optional[_Iterable[str]] = ..., bulk_shared: _Optional[int] = ..., bulk_copied: _Optional[int] = ..., refused: _Optional[int] = ..., frames_dropped: _Optional[int] = ..., device: _Optional[str] = ..., pid: _Optional[int] = ..., uptime: _Optional[float] = ..., records_dropped: _Optional[int] = ..., records_thinned: _Optional[int] = ..., records_lost: _Optional[int] = ..., recording_failure: _Optional[str] = ..., commands_refused: _Optional[int] = ..., moves_replaced: _Optional[int] = ..., bulk_bytes_out: _Optional[int] = ..., bulk_bytes_in: _Optional[int] = ..., local_workers: _Optional[_Iterable[_Union[LocalWorker, _Mapping]]] = ..., obstacles: _Optional[_Iterable[_Union[ObstaclePose, _Mapping]]] = ..., pace: _Optional[str] = ...) -> None: ...

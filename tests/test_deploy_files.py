@@ -12,6 +12,7 @@ from typing import Any
 
 import pytest
 
+from protocol.channels import DEFAULT_ENDPOINT
 from tests.docs.test_commands import PROGRAMS
 
 yaml = pytest.importorskip("yaml")
@@ -241,3 +242,19 @@ def test_a_script_without_a_scene_says_what_it_wants() -> None:
     for name in ("server.sbatch", "pool.sbatch"):
         done = subprocess.run(["bash", str(DEPLOY / "slurm" / name)], capture_output=True, text=True)
         assert done.returncode == 2 and done.stderr.startswith("usage: sbatch")
+
+
+# --- firewall -------------------------------------------------------------------------------------------------------
+
+
+def test_the_firewall_limits_new_connections_to_the_default_port_by_address() -> None:
+    path = DEPLOY / "nftables" / "warpfactor.nft"
+    rules = [line.strip() for line in path.read_text().splitlines() if "dport" in line]
+    assert len(rules) == 2
+    for rule, source in zip(rules, ("ip saddr", "ip6 saddr"), strict=True):
+        assert rule.startswith(f"tcp dport {DEFAULT_ENDPOINT.rpartition(':')[2]} ct state new update @")
+        assert f"{{ {source} limit rate over 1/second burst 30 packets }} drop" in rule
+    if (nft := shutil.which("nft")) is not None and os.geteuid() == 0:
+        check = ["unshare", "-n", nft, "-c", "-f", str(path)]
+        done = subprocess.run(check, capture_output=True, text=True, check=False)
+        assert done.returncode == 0, done.stderr

@@ -16,7 +16,7 @@ from protocol import messages_pb2 as pb
 Columns = dict[str, NDArray]
 V = TypeVar("V")
 
-INPUTS = ("asked", "probe")  # of a solve: for replays only
+INPUTS = ("asked", "probe", "left_out")  # for replays only
 REACTION = "reaction/"  # columns reaction/WHAT/force_x to torque_z [N, N m] and point_z [m]
 REACTIONS = ("force_x", "force_y", "force_z", "torque_x", "torque_y", "torque_z", "point_x", "point_y", "point_z")
 """Of what the object exerts on WHAT (`reaction_name`); the point only where the torque is about one of its own."""

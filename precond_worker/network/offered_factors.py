@@ -5,11 +5,12 @@ import logging
 import threading
 import time
 from collections.abc import Callable
+from functools import partial
+from queue import Full, Queue
 from typing import Any, NamedTuple
 
 import zenoh
 from numpy.typing import NDArray
-from zenoh.handlers import RingChannel
 
 from protocol.channels import CHANNELS, PROTOCOL, key
 from protocol.counters import Counters
@@ -22,7 +23,7 @@ from protocol.validate import check_header, parse
 
 log = logging.getLogger(__name__)
 
-QUESTIONS = 64  # that may wait; beyond that the oldest is dropped, and asked again
+QUESTIONS = 64  # that may wait; beyond that a new one is dropped, and asked again
 KEPT = 60.0  # s after the last question; the server asks twice as often at least, or has given the factor up
 
 
@@ -52,8 +53,10 @@ class OfferedFactors:
         self._lock = threading.Lock()
         self._offered: dict[str, OfferedFactor] = {}  # by object
         self._asked: dict[str, float] = {}  # when it was offered, or a part was asked for last [s, monotonic]
-        ring: RingChannel[zenoh.Query] = RingChannel(QUESTIONS)
-        self._queryable = session.zenoh.declare_queryable(self._key, ring)
+        # A queue of our own: zenoh's cannot be undeclared while a thread waits for it.
+        self._questions: Queue[zenoh.Query | None] = Queue(QUESTIONS)
+        ended = partial(self._questions.put, None)
+        self._queryable = session.zenoh.declare_queryable(self._key, zenoh.handlers.Callback(self._receive, ended))
         session.thread("parts of factors", self._run)
 
     def offer(self, object: str, header: Header, job: int, values: NDArray[Any], part_bytes: int) -> list[int]:
@@ -93,12 +96,15 @@ class OfferedFactors:
         self.clear()
         self._queryable.undeclare()
 
+    def _receive(self, query: zenoh.Query) -> None:
+        try:
+            self._questions.put_nowait(query)
+        except Full:
+            query.drop()
+
     def _run(self) -> None:
-        while True:
-            try:
-                query = self._queryable.recv()
-            except zenoh.ZError:
-                return  # the session was closed, or this
+        """Ends when the session is closed, or this."""
+        for query in iter(self._questions.get, None):
             try:
                 self._answer(query)
             except Refused as refusal:

@@ -8,6 +8,9 @@ from protocol.channels import DEFAULT_ENDPOINT
 
 NETWORK = ("tcp", "udp", "tls", "quic", "ws")
 CERTIFIED = ("tls", "quic")  # protocols that ask for certificates
+# zenoh 1.10.2 finishes one handshake of QUIC after another: a datagram that begins one, from whatever address it says,
+# keeps all new sessions out for 30 s.
+ONLY_CONNECT = "quic"
 LOCAL = ("unixsock-stream",)
 CONNECT = "WARPFACTOR_CONNECT"  # endpoints of the server, where none is given on the command line
 _ADDRESS = re.compile(r"(\[[0-9A-Fa-f:.%\w]+\]|[^:\s/\[\]]+):(\d{1,5})")
@@ -29,8 +32,13 @@ def check_endpoint(endpoint: str, *, listen: bool = False, certified: bool = Fal
     """
     protocol, _, rest = endpoint.partition("/")
     address = re.split(r"[?#]", rest, maxsplit=1)[0]
+    if listen and protocol == ONLY_CONNECT:
+        raise BadEndpoint(
+            f"endpoint {endpoint!r} cannot be listened on: one datagram to it would keep new sessions out for half a "
+            f"minute; allowed: tls/{rest}"
+        )
     if certified and protocol not in CERTIFIED and protocol in (*NETWORK, *LOCAL):
-        raise BadEndpoint(f"endpoint {endpoint!r} cannot be used with --tls; allowed: tls/HOST:PORT, quic/HOST:PORT")
+        raise BadEndpoint(f"endpoint {endpoint!r} cannot be used with --tls; allowed: tls/HOST:PORT")
     if protocol in LOCAL and address:
         return endpoint
     match = _ADDRESS.fullmatch(address)

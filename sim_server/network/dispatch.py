@@ -193,7 +193,7 @@ class Dispatch(FactorSource):
         """Objects whose job was taken from a slow worker since another one is idle; they may be submitted again."""
         with self._lock:
             slow = self.leases.reassign(
-                self._clock(), lambda job: not self._is_decoded(job) and self._has_candidates(job)
+                self._clock(), lambda job: not self._is_arriving(job) and self._has_candidates(job)
             )
             self._counters.add("passed_on", len(slow))
             return [job.object for job in slow]
@@ -638,7 +638,7 @@ class Dispatch(FactorSource):
             self._session, self._server, self._incarnation, self._counters, job, message.nonzeros, message.parts, slots
         )
         decode = partial(self.decoder.decode, message, b"", job, fetch.run)
-        future, by_slot = self._fetching.submit(decode), (message.matrix_shared, bool(slots))
+        future, by_slot = self._fetching.submit(decode), _slots_used(message, fetch)
         made = Decoding(job, future, future.result, message.seconds, by_slot, fetch=fetch)
         self._decoding[job.number] = made
         self._fetches.add(job.number)
@@ -657,12 +657,17 @@ class Dispatch(FactorSource):
         """True while the answer to a job is taken in beside the caller."""
         return job.number in self._decoding
 
+    def _is_arriving(self, job: InFlightJob) -> bool:
+        """True while the answer to a job is taken in, unless it comes in parts and none comes any more."""
+        each = self._decoding.get(job.number)
+        return each is not None and not (each.fetch is not None and each.fetch.stalls)
+
     def _take_decoded(self) -> None:
         """Takes the large factors that were decoded beside the caller, unless their jobs are over."""
         for number in self._fetches:
             job, fetch = self._decoding[number].job, self._decoding[number].fetch
             if fetch is not None and self.leases.by_object.get(job.object) is not job:
-                fetch.gone.set()
+                fetch.give_up()
         for number in [number for number, each in self._decoding.items() if each.future.done()]:
             each = self._decoding.pop(number)
             self._fetches.discard(number)
@@ -677,13 +682,16 @@ class Dispatch(FactorSource):
                 if self.leases.is_reassigned(current):
                     self.leases.finish(current)
                 else:
-                    self._take_factor(current, each.take, "", each.seconds, each.by_slot, each.duration)
+                    by_slot = each.by_slot if fetch is None else (each.by_slot[0], bool(fetch.slots))
+                    self._take_factor(current, each.take, "", each.seconds, by_slot, each.duration)
             except Refused as refusal:
                 self._counters.refuse(refusal)
 
     def _end_gone(self, job: InFlightJob) -> None:
         """Frees the worker of a job that is over, if it is still there."""
         if self.leases.by_worker.get(job.worker, {}).get(job.number) is job:
+            if self.leases.is_reassigned(job):  # its parts did not come
+                self._reliability.on_failure(job.worker, job.object, self._clock())
             self.leases.finish(job)
 
     def _take_factor(
@@ -748,6 +756,6 @@ def _result(future: Future[list[Factor | Refused]], place: int) -> Factor:
     return found
 
 
-def _slots_used(message: FactorMessage) -> tuple[bool, bool]:
-    """Whether matrix and factor travelled in shared memory."""
-    return message.matrix_shared, message.HasField("slot")
+def _slots_used(message: FactorMessage, fetch: FactorFetch | None = None) -> tuple[bool, bool]:
+    """Whether matrix and factor travelled in shared memory. fetch: of its parts"""
+    return message.matrix_shared, message.HasField("slot") or (fetch is not None and bool(fetch.slots))

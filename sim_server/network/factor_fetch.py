@@ -27,6 +27,7 @@ from sim_server.network.leases import MIN_BANDWIDTH, InFlightJob
 AHEAD = 2  # parts asked for at a time: one is copied while the next is under way
 ANSWERS = 4  # to a question that wait to be read; forged ones stand in the way of nobody else
 QUESTION_TIME = 10.0  # s for the answer to a question
+STALL = 5.0  # s without a part, after which another worker may have the job
 ATTEMPTS = 3  # questions for one part
 PAUSE = 0.2  # s between two of them
 ALL, NONE = zenoh.QueryTarget.ALL, zenoh.ConsolidationMode.NONE  # the key of a worker may have a forger, too
@@ -37,7 +38,7 @@ class FactorFetch:
 
     job: answered by the worker that keeps the factor; parts: checksum of each
     slots: AHEAD of them for a worker on this host; none: parts travel as bytes
-    gone: set by others when nobody waits for the factor any more
+    gone: set once nobody waits for the factor any more
     """
 
     def __init__(
@@ -51,6 +52,19 @@ class FactorFetch:
         self.gone = threading.Event()
         self.clean = False  # all questions were answered: the worker writes to no slot any more
         self._repeated = False
+        self._cancelling = zenoh.CancellationToken()
+        self._came = time.monotonic()  # when it was announced, or a part came last
+
+    def give_up(self) -> None:
+        """Ends `run` soon: nobody waits for the factor any more. For other threads; does not wait for it."""
+        if not self.gone.is_set():
+            self.gone.set()
+            self._cancelling.cancel()
+
+    @property
+    def stalls(self) -> bool:
+        """True if no part has come for a while."""
+        return time.monotonic() > self._came + STALL
 
     def run(self) -> Float32 | Float64:
         """Returns the values; raises Refused."""
@@ -103,6 +117,7 @@ class FactorFetch:
         except Refused as refusal:
             self._counters.refuse(refusal)
             return False
+        self._came = time.monotonic()
         return True
 
     def _slot(self, number: int) -> Slot:
@@ -117,7 +132,7 @@ class FactorFetch:
             return self._session.get(
                 self._key, FifoChannel(ANSWERS), payload=question.SerializeToString(), timeout=QUESTION_TIME,
                 target=ALL, consolidation=NONE, priority=zenoh.Priority.DATA_LOW,
-                congestion_control=zenoh.CongestionControl.BLOCK,
+                congestion_control=zenoh.CongestionControl.BLOCK, cancellation_token=self._cancelling,
             )  # fmt: skip
         except zenoh.ZError as error:
             raise Refused(f"a part of a factor was not asked for: {error}", "late") from error

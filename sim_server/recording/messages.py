@@ -178,12 +178,12 @@ def steps(
 def encoded_steps(
     simulation: Simulation, records: NDArray[Any], methods: Callable[[int, int], Method | None] | None = None,
     reactions: Reactions | None = None, readings: Readings | None = None, excess: Float64 | None = None,
-    age_bound: int = 0, additions: Additions | None = None,
+    age_bound: int = 0, additions: Additions | None = None, left_out: NDArray[np.int64] | None = None,
 ) -> list[Encoded]:  # fmt: skip
     """Step records (structs.RECORD) as messages.
 
     methods: of body and step, how that factor was made ("auto"). reactions, readings: of the same records
-    excess, age_bound: as of object_steps.encoded. additions: what else the messages have
+    excess, age_bound, left_out: as of object_steps.encoded. additions: what else the messages have
     """
     bodies, added = simulation.world.bodies, Additions() if additions is None else additions
     names = [bodies[body].name for body in records["body"].tolist()]
@@ -191,7 +191,7 @@ def encoded_steps(
         reactions.add_to(added, records)
     if readings is not None:
         readings.add_to(added, names)
-    data = encoded(records, names, _preconditioners(simulation, records, methods), excess, age_bound)
+    data = encoded(records, names, _preconditioners(simulation, records, methods), excess, age_bound, left_out)
     for number, message in added.items():
         data[number] += message.SerializeToString()
     return list(map(Encoded, names, records["step"].tolist(), records["time"].tolist(), data))

@@ -129,12 +129,13 @@ class Readings:
 
 def encoded(
     records: NDArray[Any], names: Sequence[str], kinds: Sequence[Sequence[str]], excess: Float64 | None = None,
-    age_bound: int = 0,
+    age_bound: int = 0, left_out: NDArray[np.int64] | None = None,
 ) -> list[bytes]:  # fmt: skip
     """Serializes the messages of records (structs.RECORD), but for reactions, readings and interactions.
 
     names: of their objects. kinds: names of the preconditioners that solves used, and of those that they began with
     excess: (records,) of the scheduler, and the age that factors are to have at most; 0 without them
+    left_out: (records,) how many of its object before each are not in the log
     """
     common = list(zip(names, *kinds, strict=True))
     numbers = {each: k for k, each in enumerate(dict.fromkeys(common))}
@@ -151,6 +152,8 @@ def encoded(
     columns["factor_age_bound"] = np.full(len(records), age_bound, np.int64)
     if excess is not None:
         columns["excess"] = excess
+    if left_out is not None:
+        columns["left_out"] = left_out
     return encode(KNOWN, columns, prefixes, number)
 
 

@@ -69,6 +69,7 @@ class Recorder:
         self.path = Path(path)
         self.dropped = 0  # frames
         self.lost = 0  # records of other kinds
+        self.thinned = 0  # step records that were left out because it was behind, as the caller counts them
         self.written = 0  # records handed to the file
         self.bytes_written = 0
         self.failure = ""  # why the log is not whole
@@ -252,7 +253,12 @@ class Recorder:
                 return
 
     def _notes(self) -> dict[str, int]:
-        return {"frames_dropped": self.dropped, "records_lost": self.lost}
+        return {"frames_dropped": self.dropped, "records_lost": self.lost, "records_thinned": self.thinned}
+
+    @property
+    def behind(self) -> bool:
+        """True while so much waits for the disk that frames will be dropped soon."""
+        return self._waiting_bytes > self._frame_bytes // 2
 
     def _break_off(self, error: Exception) -> None:
         """Leaves the file; records are lost from now on."""

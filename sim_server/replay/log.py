@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from protocol import messages_pb2 as pb
 from protocol.log_chunks import BadLog
-from protocol.log_file import LogFile, LogMessage
+from protocol.log_file import KEPT_EVERY, LogFile, LogMessage
 from protocol.refused import Refused
 from protocol.validate import array, checksum
 from sim_server.arrays import Float64
@@ -51,6 +51,8 @@ class RecordedObject:
     frames: (offset, number) of each (log_file.py), by step
     factors: by the step whose matrix they were made from
     rows: of type ROW; rows[k] is of step first + k + 1
+    left_out: by step, how many records before it were left out, as the log could not follow
+    filled: (rows,) True where the record was left out: the row tells what the solve was given, and nothing else
     reactions: by step and kind, digests of those that there are
     """
 
@@ -59,6 +61,8 @@ class RecordedObject:
     frames: dict[int, tuple[int, int]] = field(default_factory=dict)
     factors: dict[int, pb.FactorUse] = field(default_factory=dict)
     rows: NDArray[np.void] = field(default_factory=lambda: np.zeros(0, ROW))
+    left_out: dict[int, int] = field(default_factory=dict)
+    filled: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, bool))
     reactions: dict[tuple[int, str], int] = field(default_factory=dict)
 
 
@@ -166,6 +170,8 @@ class Recording:
         elif kind == "step":
             s = pb.ObjectStep.FromString(data)
             found.packed += _PACK.pack(*_row(s).values())
+            if s.left_out:
+                found.left_out[s.step] = s.left_out
             found.reactions |= {(s.step, kind): digest for kind, digest in reaction_digests(s).items()}
 
     def _complete(self) -> int:
@@ -173,7 +179,7 @@ class Recording:
         last, most, gap = [], 0, ""
         for name in self.scene.objects:
             found = self.objects.setdefault(name, RecordedObject())
-            rows = np.sort(np.frombuffer(bytes(found.packed), ROW), order="step")
+            rows, found.filled = filled(np.sort(np.frombuffer(bytes(found.packed), ROW), order="step"), found.left_out)
             found.packed = bytearray()
             whole = len(rows)
             wrong = np.flatnonzero(rows["step"] != self.first + np.arange(1, len(rows) + 1))
@@ -186,6 +192,11 @@ class Recording:
         steps = min(last, default=0)
         if steps < most and gap:
             self.notes.append(f"{gap}: the replay ends before it, the log at step {most}")
+        if thinned := sum(int(found.filled.sum()) for found in self.objects.values()):
+            self.notes.append(
+                f"{self.path}: {thinned} step records were left out, as the log could not follow: their steps are "
+                "repeated and not compared"
+            )
         return steps
 
     def _check(self) -> None:
@@ -207,6 +218,20 @@ class Recording:
                 f"{self.path}: written by an older version, which did not record the build, the steps at which pushes "
                 "and grabs took effect, and probes of the automatic preconditioner: only runs without these repeat"
             )
+
+
+def filled(rows: NDArray[np.void], left_out: dict[int, int]) -> tuple[NDArray[np.void], NDArray[np.bool_]]:
+    """Adds the rows of steps whose records were left out, and returns which these are. rows: (k,) by step"""
+    gaps = np.diff(rows["step"]) - 1
+    told = np.array([left_out.get(step, 0) for step in rows["step"][1:].tolist()], np.int64)
+    gaps[(gaps != told) | (gaps >= KEPT_EVERY) | (gaps < 0)] = 0  # others are losses
+    counts = np.ones(len(rows), np.int64)
+    counts[:-1] += gaps
+    source = np.arange(len(rows)).repeat(counts)
+    whole, after = rows[source], np.arange(len(source)) - (np.cumsum(counts) - counts)[source]
+    whole["step"] += after
+    whole["status"][after > 0] = pb.CONVERGED
+    return whole, after > 0
 
 
 def reaction_digests(message: pb.ObjectStep) -> dict[str, int]:

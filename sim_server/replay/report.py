@@ -52,8 +52,11 @@ class Comparison:
             self.other_factor = {"step": step, "object": name, "detail": detail}
 
     def solves(self, records: NDArray[Any], rows: list[Any]) -> None:
-        """Compares one step: records of the engine with rows of the log, one for each body, in order."""
+        """Compares one step: records of the engine with rows of the log, one for each body, in order; None: the log
+        has none."""
         for record, row, name in zip(records, rows, self.recording.scene.objects, strict=True):
+            if row is None:
+                continue
             self.solves_compared += 1
             recorded = [n for n in COMPARED if n not in OPTIONAL or not math.isnan(row[n])]
             different = [n for n in recorded if not _same(record[n], row[n])]

@@ -141,11 +141,14 @@ class Replay:
                 self._use_factor(body.index, body.name, step, fresh=True)
             self.engine.solve()
             records, on_obstacles = self.engine.records_and_reactions()
-            self.compared.solves(records, [self._row(b.name, step) for b in self.bodies])
+            there = [b.index for b in self.bodies if not self._left_out(b.name, step)]
+            rows = [self._row(b.name, step) if b.index in there else None for b in self.bodies]
+            self.compared.solves(records, rows)
             if self.compared.kinds:
                 exerted = messages.reactions(self.simulation, on_obstacles, self.engine.other_reactions())
                 told = messages.readings(self.simulation, self.engine.readings)
-                self.compared.reactions(messages.steps(self.simulation, records, reactions=exerted, readings=told))
+                steps = messages.steps(self.simulation, records, reactions=exerted, readings=told)
+                self.compared.reactions([steps[k] for k in there])
             self._compare_frames(step + 1)
             progress(step + 1)
         return self.compared
@@ -156,6 +159,9 @@ class Replay:
     def _row(self, name: str, step: int) -> np.void:
         row: np.void = self._rows(name)[step - self.recording.first]
         return row
+
+    def _left_out(self, name: str, step: int) -> bool:
+        return bool(self.recording.objects[name].filled[step - self.recording.first])
 
     def _last_uses(self) -> dict[tuple[str, int], int]:
         uses: dict[tuple[str, int], int] = {}

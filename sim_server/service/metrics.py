@@ -157,6 +157,9 @@ class ServerMetrics:
         yield _counter("warpfactor_log_records", "Records written to the log", log.written)
         yield _counter("warpfactor_log_bytes", "Bytes written to the log", log.bytes_written)
         yield _counter("warpfactor_log_records_lost", "Records but frames that are not in the log", log.lost)
+        yield _counter(
+            "warpfactor_log_records_thinned", "Step records left out of the log, which could not follow", log.thinned
+        )
         yield _counter("warpfactor_log_frames_dropped", "Frames that are not in the log", log.dropped)
         yield _gauge("warpfactor_log_broken", "1: the log is not written", [], [([], float(log.broken))])
 

@@ -375,7 +375,7 @@ class Service:
         contact = self.telemetry.contact
         undone = [*contact.count_clipped(records), *contact.crowded_nodes(), *contact.broken_ties()]
         told = [*self.telemetry.count_unconverged(records), *self.telemetry.halved(records)]
-        told += [*self.telemetry.gained_energy(records), *self.telemetry.many_substeps()]
+        told += [*self.telemetry.gained_energy(records), *self.telemetry.many_substeps(), *self.telemetry.losses()]
         for line in [*told, *undone]:
             log.warning("%s", line)
         for line in [*self.telemetry.count_runaways(records), *self.telemetry.not_finite(records)]:

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from protocol import messages_pb2 as pb
+from protocol.log_file import KEPT_EVERY
 from protocol.method import Method
 from sim_server.arrays import Float64
 from sim_server.backends.kinds import SLACK_OF_ENERGY
@@ -30,6 +31,7 @@ from sim_server.service.commands import Commands
 from sim_server.service.contact_telemetry import ContactTelemetry
 from sim_server.service.cuts import CutTelemetry
 from sim_server.service.event_counts import EventCounts
+from sim_server.service.log_thinning import LogThinning
 from sim_server.service.reaction_telemetry import ReactionTelemetry
 from sim_server.service.unsent_steps import UnsentSteps
 from sim_server.simulation import Simulation
@@ -43,6 +45,7 @@ STATE_PERIOD = 1 / 30  # s between states for viewers
 STATUS_PERIOD = 1.0  # s
 LOOK_PERIOD = 0.02  # s between checks for subscribers
 MAX_BATCH = 4096  # step records sent together at most
+BEHIND = 0.5  # part of the loop's room for records that is full: the log does not follow
 STATISTICS_STEPS = 1000  # last steps that percentiles and means are taken over
 MANY_SUBSTEPS = 10_000  # explicit ones of a step, of which it is told
 ENERGY_STEPS = 20  # steps between elastic energies in real time: one costs up to a fifth of a step
@@ -78,6 +81,8 @@ class Telemetry:
         self.started = time.monotonic()
         self.record_every = self.simulation.scene.record.every if recorder else 0
         self._unsent = UnsentSteps(MAX_BATCH)
+        self._thinning = LogThinning(len(self.simulation.world.bodies))
+        self._told_losses: set[str] = set()
         bodies = len(self.simulation.world.bodies)
         self._window = np.zeros((bodies, STATISTICS_STEPS), np.int32)  # iterations of the last steps
         self._told = np.zeros(bodies, np.int64)  # steps of each body
@@ -110,6 +115,8 @@ class Telemetry:
 
         resumed: where the run goes on; the log has it, too, so that it can be repeated
         """
+        import scipy.spatial  # noqa: F401  for tips; on a busy machine the first status would wait seconds for it
+
         message = messages.scene(self.simulation)
         message.server = self.link.name
         self.link.set_scene(messages.published(message))
@@ -149,7 +156,7 @@ class Telemetry:
             self.reactions.publish(records, reactions)
             self._note_interactions()
             if self.recorder:
-                self.recorder.steps(self._encoded(records, reactions, readings), block=self.patient)
+                self.recorder.steps(self._logged(self.recorder, records, reactions, readings), block=self.patient)
             if self.link.wants_steps():
                 self._unsent.add(records, reactions, readings)
         if self._is_due("steps", STEPS_PERIOD):
@@ -184,15 +191,29 @@ class Telemetry:
         evaluated = np.flatnonzero(np.isfinite(records["elastic"]))
         self._energy[records["body"][evaluated]] = energy[evaluated]
 
+    def _logged(
+        self, recorder: Recorder, records: NDArray[Any], reactions: Reactions, readings: Readings | None
+    ) -> list[Encoded]:  # fmt: skip
+        """Makes messages for the log: of all records, or in real time of what it can follow."""
+        if self.patient:
+            return self._encoded(records, reactions, readings)
+        behind = recorder.behind or len(records) > BEHIND * self.engine.loop.record_capacity
+        chosen, left_out = self._thinning.choose(records, behind)
+        recorder.thinned = self._thinning.count
+        told = None if readings is None else readings[chosen]
+        return self._encoded(as_bytes(records)[chosen].view(records.dtype), reactions[chosen], told, left_out)
+
     def _encoded(
-        self, records: NDArray[Any], reactions: Reactions, readings: Readings | None
+        self, records: NDArray[Any], reactions: Reactions, readings: Readings | None,
+        left_out: NDArray[np.int64] | None = None,
     ) -> list[Encoded]:  # fmt: skip
         """Makes messages for the log and for subscribers only: it is the most expensive part of telemetry."""
         excess = np.array([state.solves.excess for state in self.driver.bodies])[records["body"]]
         additions = self._acting(records)
         return messages.encoded_steps(
-            self.simulation, records, self._method, reactions, readings, excess, self.driver.age_bound(), additions
-        )
+            self.simulation, records, self._method, reactions, readings, excess, self.driver.age_bound(), additions,
+            left_out,
+        )  # fmt: skip
 
     def _method(self, body: int, step: int) -> Method | None:
         """Returns how the factor of a step was made."""
@@ -351,6 +372,7 @@ class Telemetry:
         dropped = loop.frames_dropped + (self.recorder.dropped if self.recorder else 0)
         status.frames_dropped, status.records_dropped = dropped, loop.records_dropped + loop.others_dropped
         status.records_lost = self.recorder.lost if self.recorder else 0
+        status.records_thinned = self._thinning.count
         status.recording_failure = self.recorder.failure[:400] if self.recorder else ""
         bound = self.driver.age_bound()
         latest = self._latest(bound)
@@ -462,6 +484,20 @@ class Telemetry:
                 "dt or more linearizations may help"
             )
         return lines
+
+    def losses(self) -> list[str]:
+        """Returns a line when records are missing for the first time, of each kind."""
+        found, losses = [], (
+            (self._thinning.count, "the log cannot follow: of steps in which nothing changes it has, until it can, the "
+             f"records of every {KEPT_EVERY}th alone; a replay repeats all of them"),
+            (self.engine.loop.records_dropped, "records of whole steps were not read in time and are lost" + (
+                ", for the log, too: a replay ends before them" if self.recorder else "")),
+        )  # fmt: skip
+        for count, line in losses:
+            if count and line not in self._told_losses:
+                self._told_losses.add(line)
+                found.append(f"step {self.engine.step}: {line}; further ones are counted")
+        return found
 
     def many_substeps(self) -> list[str]:
         """Returns a line, once, if a step makes very many explicit substeps: while the first one is under way."""

@@ -65,9 +65,11 @@ class Arena:
         self.folder = Path(self._closing.enter_context(tempfile.TemporaryDirectory(prefix="warpfactor-attacks-")))
         self.tls, self.log = tls, self.folder / "run.mcap"
         self.endpoint = f"{'tls' if tls else 'tcp'}/127.0.0.1:{free_port()}"
+        self._beside = self.endpoint.rpartition(":")[0] + f":{free_port()}"
         self._certs = self.folder / "certs"
         (self.folder / "scene.toml").write_text(SCENE)
-        words = ["--listen", self.endpoint, "--workers", "1", "--record", str(self.log), "--device", "cpu"]
+        words = ["--listen", self.endpoint, "--listen", self._beside, "--workers", "1", "--device", "cpu"]
+        words += ["--record", str(self.log)]
         if tls:
             self._run("sim_server", "certs", str(self._certs), "--host", "localhost")
             words += ["--tls", str(self._certs)]
@@ -116,7 +118,9 @@ class Arena:
         status = self.client.status(fresh=True)
         worker = status.workers[0] if status.workers else pb.WorkerInfo()
         held = self.grab.interaction.id
-        return Victim(status.header.incarnation, self.client.id, held, worker.worker, worker.pid, worker.host)
+        return Victim(
+            status.header.incarnation, self.client.id, held, worker.worker, worker.pid, worker.host, self._beside
+        )
 
     def meet(self, attack: Attack) -> Outcome:
         """Makes an attack while the honest client works; returns what became of it once a new factor is in use."""

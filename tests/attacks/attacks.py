@@ -29,7 +29,10 @@ BLOCK = zenoh.CongestionControl.BLOCK
 
 @dataclass(frozen=True)
 class Victim:
-    """What anybody can read in the status, of who uses the server honestly. incarnation: of the server."""
+    """What anybody can read in the status, of who uses the server honestly. incarnation: of the server.
+
+    beside: a second endpoint at which it listens
+    """
 
     incarnation: int
     client: str
@@ -37,6 +40,7 @@ class Victim:
     worker: str
     pid: int
     host: str
+    beside: str
 
 
 class Attacker:
@@ -339,12 +343,14 @@ def _sleep(a: Attacker) -> None:
 # --- connections ----------------------------------------------------------------------------------------------------
 
 
-def connections(a: Attacker, count: int, data: bytes = b"") -> None:
-    """With TLS fewer: zenoh takes no other connection for 0.1 s after each handshake that fails."""
+def connections(a: Attacker, count: int, data: bytes = b"", beside: bool = False) -> None:
+    """With TLS fewer: zenoh takes no other connection for 0.1 s after each handshake that fails. beside: to the second
+    endpoint of the server."""
     found = []
+    endpoint = a.victim.beside if beside else a.endpoint
     with suppress(OSError):
-        for _ in range(count if a.identity is None else 100):
-            one = socket.create_connection((host_of(a.endpoint), port_of(a.endpoint)), timeout=1.0)
+        for _ in range(count if a.identity is None or beside else 100):
+            one = socket.create_connection((host_of(endpoint), port_of(endpoint)), timeout=1.0)
             found.append(one)
             if data:
                 one.sendall(data)
@@ -362,6 +368,7 @@ def garbage(a: Attacker) -> None:
 each("connections", {
     "1500 that say nothing, with TLS 100": lambda a: connections(a, 1500),
     "300 of random bytes, with TLS 100": lambda a: connections(a, 300, os.urandom(2000)),
+    "1500 of random bytes, at another endpoint": lambda a: connections(a, 1500, os.urandom(500), beside=True),
     "30 sessions, one after another": lambda a: [a.session().close() for _ in range(30)],
 })  # fmt: skip
 attack("garbage on every channel")(garbage)

@@ -32,7 +32,7 @@ def _server() -> set[str]:
     from sim_server.backends.cpu.structs import RECORD
     from sim_server.service.metrics import ServerMetrics
 
-    log = SimpleNamespace(written=1, bytes_written=1, lost=0, dropped=0, broken=False)
+    log = SimpleNamespace(written=1, bytes_written=1, lost=0, thinned=0, dropped=0, broken=False)
     link = SimpleNamespace(name="sim", counters=_counters())
     metrics = ServerMetrics(["a"], link, log)  # type: ignore[arg-type]
     metrics.add(np.ones(1, RECORD)[:0])

@@ -86,6 +86,7 @@ def test_channels() -> None:
         ("protocol.md", f"more than {WHOLE_PARTS * PART_BYTES >> 20} MiB that has no slot"),
         ("protocol.md", f"parts, {PART_BYTES >> 20} MiB each"),
         ("protocol.md", f"asked for three times, {factor_fetch.QUESTION_TIME:g} s each"),
+        ("protocol.md", f"no part has come for {factor_fetch.STALL:g} s"),
         ("protocol.md", f"The most is {MOST_VALUES:,} values"),
         ("protocol.md", f"above {leases.LEASE_BLOCKS:,} of them"),
         ("scenes.md", f"is at most {integrator_options.MAX_STATES}"),

@@ -44,7 +44,7 @@ def told(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactor
     statuses: list[pb.Status] = []
     link: Any = SimpleNamespace(publish_status=statuses.append, wants_steps=lambda: False)
     recorder: Any = SimpleNamespace(
-        dropped=0, lost=0, failure="",
+        dropped=0, lost=0, failure="", behind=False,
         steps=lambda steps, block: logged.extend(pb.ObjectStep.FromString(step.data) for step in steps),
     )  # fmt: skip
     driver = Driver(sim)

@@ -141,7 +141,7 @@ def test_slow_disk_drops_frames_and_keeps_steps(stuck: _StuckFile) -> None:
     recorder.close()
     assert stuck.topics.count("/step/beam") == 100
     assert stuck.topics.count("/state/beam") == 100 - recorder.dropped
-    assert stuck.notes == {"frames_dropped": str(recorder.dropped), "records_lost": "0"}
+    assert stuck.notes == {"frames_dropped": str(recorder.dropped), "records_lost": "0", "records_thinned": "0"}
 
 
 def test_stuck_disk_is_bounded_in_memory(stuck: _StuckFile) -> None:

@@ -5,6 +5,7 @@ import math
 
 import numpy as np
 import pytest
+from google.protobuf.descriptor import FieldDescriptor
 
 from protocol import messages_pb2 as pb
 from sim_server.backends.cpu.structs import RECORD
@@ -27,7 +28,8 @@ def strange(count: int = 200) -> np.ndarray:
     """Records of any numbers that their columns may hold."""
     rng, records = np.random.default_rng(1), np.zeros(count, RECORD)
     for name in RECORD.names or ():
-        values = REAL if RECORD[name].kind == "f" else WHOLE
+        flag = name in COPIED and KNOWN[COPIED[name]].type == FieldDescriptor.TYPE_BOOL
+        values = REAL if RECORD[name].kind == "f" else (0, 1) if flag else WHOLE
         records[name] = rng.choice(values, count)
     records["step"] = rng.choice([1, 1 << 40, (1 << 63) - 1], count)
     records["factor_step"] = rng.choice([-1, 0, 5, 1 << 40], count)

@@ -45,6 +45,12 @@ def test_who_listens_everywhere_is_reached_by_loopback(listen: str, reached: str
     assert on_this_machine(listen) == reached
 
 
+@pytest.mark.parametrize("certified", [True, False])
+def test_nobody_listens_by_quic(certified: bool) -> None:
+    with pytest.raises(BadEndpoint, match=r"cannot be listened on: one datagram .* allowed: tls/0\.0\.0\.0:7447"):
+        check_endpoint("quic/0.0.0.0:7447", listen=True, certified=certified)
+
+
 def test_any_free_port_may_be_listened_on() -> None:
     assert check_endpoint("tcp/127.0.0.1:0", listen=True)
 

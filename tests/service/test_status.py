@@ -39,7 +39,7 @@ def test_the_status_counts_what_the_loop_dropped_and_what_the_log_lost():
 def test_the_client_shows_these_numbers():
     text = io.StringIO()
     Console(width=200, file=text).print(tables(pb.Status(frames_dropped=4, records_dropped=51, records_lost=62)))
-    assert "dropped: frames 4, step records 51; lost to the log 62" in text.getvalue()
+    assert "dropped: frames 4, step records 51; lost to the log 62, left out of it 0" in text.getvalue()
     assert "the log is not whole" not in text.getvalue()
     Console(width=200, file=text).print(tables(pb.Status(recording_failure="/x.mcap: No space left on device")))
     assert "the log is not whole: /x.mcap: No space left on device" in text.getvalue()
@@ -88,7 +88,7 @@ def test_the_status_and_the_log_tell_the_age_of_factors_and_its_bound():
     found, logged = [], []
     link = SimpleNamespace(publish_status=found.append, wants_steps=lambda: False)
     recorder = SimpleNamespace(
-        dropped=0, lost=0, failure="",
+        dropped=0, lost=0, failure="", behind=False,
         steps=lambda steps, block: logged.extend(pb.ObjectStep.FromString(step.data) for step in steps),
     )  # fmt: skip
     driver = Driver(sim)

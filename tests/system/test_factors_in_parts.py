@@ -143,6 +143,29 @@ def test_a_large_factor_holds_up_no_other_object(monkeypatch: pytest.MonkeyPatch
         assert is_right(driver.factors[1]) and driver.failures == []
 
 
+def test_who_announces_and_sends_nothing_is_passed_over(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Another worker has the job once no part has come for a while, and the questions that wait end at once."""
+    monkeypatch.setattr(factor_fetch, "STALL", 0.2)
+    monkeypatch.setattr(factor_fetch, "QUESTION_TIME", 1000.0)
+    endpoint = free_endpoint()
+    with ServerLink(listen=[endpoint], silence=60) as link, PartsByHand(endpoint, link.incarnation) as hand:
+        driver, held = Driver(link), list[Any]()  # questions that are never answered
+        link.announce(BEAM)
+        hand.hello()
+        driver.submit(BEAM, 1)
+        answer, _ = hand.announcement(hand.receive())
+        hand.session.zenoh.declare_queryable(key("part", worker="hand"), held.append)
+        hand.answer(answer)
+        driver.until(lambda: held, "a question")
+        with light_worker(endpoint):
+            driver.until(lambda: len(link.dispatch.workers()) == 2, "the other worker")
+            driver.until(lambda: link.dispatch.reassigned() == ["beam"], "the job to be free")
+            driver.until(lambda: not link.dispatch._decoding, "the end of the fetch")
+            assert link.dispatch._reliability.failing_objects == {"beam"}, "it is held against who sent nothing"
+            hand.close()
+            assert is_right(driver.factor(BEAM, 2)) and driver.factors[0].worker == "light"
+
+
 def test_a_split_drops_what_is_under_way(monkeypatch: pytest.MonkeyPatch) -> None:
     gate = Gate(monkeypatch, "beam", after=2)
     endpoint, split = free_endpoint(), chain(nodes=9, epoch=2)

@@ -3,6 +3,8 @@
 
 import os
 import signal
+import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -302,3 +304,22 @@ def test_without_a_worker_it_says_once_that_nothing_makes_factors(
     assert len(lines) == told
     if told:
         assert f"precond-worker --connect {endpoint} --server mine, or this server with --workers 1" in lines[0]
+
+
+def test_the_first_status_waits_for_no_import(tmp_path: Path) -> None:
+    """On a busy machine a large library takes longer to load than a client waits."""
+    code = """
+import sys
+from pathlib import Path
+from sim_server.network.link import ServerLink
+from sim_server.service.service import Service
+from sim_server.simulation import Simulation
+with ServerLink(listen=[sys.argv[2]]) as link:
+    service = Service(Simulation.load(Path(sys.argv[1])), link, steps=1)
+    before = set(sys.modules)
+    service.telemetry.publish_status("running", where=True)
+    print(sorted(set(sys.modules) - before))
+"""
+    command = [sys.executable, "-c", code, str(beam(tmp_path)), free_endpoint()]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"

@@ -178,9 +178,11 @@ def lives(o: argparse.Namespace, limit: Limit) -> list[Row]:
 
 
 def memory(pid: int) -> dict[str, float]:
-    """Of a process: resident and locked MB; in /dev/shm all of zenoh's MB."""
+    """Of a process: resident and locked MB; of zenoh's files in /dev/shm the MB that it maps."""
     lines = dict(line.split(":", 1) for line in Path(f"/proc/{pid}/status").read_text().splitlines() if ":" in line)
-    shared = sum(file.stat().st_size for file in Path("/dev/shm").glob("*.zenoh"))
+    maps = [line.split(maxsplit=5) for line in Path(f"/proc/{pid}/maps").read_text().splitlines()]
+    ranges = [m[0].split("-") for m in maps if len(m) == 6 and m[5].startswith("/dev/shm/") and ".zenoh" in m[5]]
+    shared = sum(int(end, 16) - int(begin, 16) for begin, end in ranges)
     return {
         "server resident MB": int(lines["VmRSS"].split()[0]) / 1024,
         "server locked MB": int(lines["VmLck"].split()[0]) / 1024,

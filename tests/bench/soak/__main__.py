@@ -4,6 +4,7 @@
 import argparse
 import random
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -45,7 +46,8 @@ back to the start. Sampled every {sample:g} s.
 
 *an hour*: slope of a straight line through the samples of the last three quarters of the run. *step*:
 median of the loop's own processor time for a step in that part of the run, from the log; a body that was
-cut is smaller. *commands refused*: those that the server did not carry out."""
+cut is smaller. *commands refused*: those that the server did not carry out; *unanswered*: those that had no
+answer within the time that the client waits."""
 RATES = {"sample": 5.0, "kill": 7.0, "cut": 20.0, "reset": 60.0}  # s
 QUICK = {"sample": 0.5, "kill": 2.0, "cut": 2.0, "reset": 4.0}
 PARTS = 4
@@ -59,7 +61,7 @@ class Doings:
         self._due = {name: time.monotonic() + rate for name, rate in rates.items() if name != "sample"}
         self._worker = stage.worker("life-0")
         self._kept: list[Client] = []
-        self.counts = dict.fromkeys(("clients", "commands", "refused", "killed", "cut", "reset"), 0)
+        self.counts = dict.fromkeys(("clients", "commands", "refused", "unanswered", "killed", "cut", "reset"), 0)
 
     def round(self) -> None:
         """A client that comes and goes; and what is due."""
@@ -71,17 +73,20 @@ class Doings:
                 getattr(self, f"_{name}")()
 
     def _visit(self) -> None:
-        rng, client = self._random, self._stage.client()
+        rng, client = self._random, self._do(self._stage.client)
+        if client is None:
+            return
         self.counts["clients"] += 1
         self._do(lambda: client.set("beam.corotational.young", rng.choice((5e4, 1e5, 2e5))))
         self._do(lambda: client.push("beam", "top", force=(0, rng.uniform(0, 20), 0), duration=0.2))
         grab = self._do(lambda: client.grab("beam", "top", radius=0.05, stiffness=500.0))
-        states = client.states()
+        states = self._do(client.states)
         for _ in range(5):
             if grab is not None:
                 self._do(lambda: grab.move((rng.uniform(-0.1, 0.1), rng.uniform(0.1, 0.4), 0.1)))
             time.sleep(0.05)
-            states.newest()
+            if states is not None:
+                states.newest()
         if grab is not None and rng.random() < 0.5:
             self._do(grab.release)  # else it ends with the client
         client.close()
@@ -90,8 +95,8 @@ class Doings:
         self.counts["commands"] += 1
         try:
             return command()
-        except (ClientError, BadInput):
-            self.counts["refused"] += 1
+        except (ClientError, BadInput) as error:
+            self.counts["unanswered" if "did not answer" in str(error) else "refused"] += 1
             return None
 
     def _kill(self) -> None:
@@ -102,14 +107,19 @@ class Doings:
 
     def _cut(self) -> None:
         low = self._random.uniform(0, 0.15)
-        with self._stage.client() as client:
-            self._do(lambda: client.cut("beam", where=f"Z > {low} and Z < {low + 0.03} and Y > 0.06"))
+        self._alone(lambda client: client.cut("beam", where=f"Z > {low} and Z < {low + 0.03} and Y > 0.06"))
         self.counts["cut"] += 1
 
     def _reset(self) -> None:
-        with self._stage.client() as client:
-            self._do(client.reset)
+        self._alone(lambda client: client.reset())
         self.counts["reset"] += 1
+
+    def _alone(self, command: Callable[[Client], Any]) -> None:
+        """A command of a client that comes for it alone."""
+        client = self._do(self._stage.client)
+        if client is not None:
+            self._do(lambda: command(client))
+            client.close()
 
 
 def sampled(pid: int, began: float) -> dict[str, float]:
