@@ -13,14 +13,14 @@ MOST_FILES = 12  # of a folder of theirs, without __init__.py
 PRIVATE_NAMES = 15  # that tests may use, fewer than
 ALLOWED = {  # what each folder imports of its package
     "protocol.access": {"refused"},
-    "protocol.network": {"access", "channels", "process", "refused", "shared_memory"},
+    "protocol.network": {"access", "channels", "process", "refused", "shared_memory", "validate"},
     "protocol.materials": set(),
     "protocol.process": set(),
     "protocol.shared_memory": {"channels", "refused", "validate"},
     "precond_worker.symbolic": {"arrays"},
     "precond_worker.gpu": {"arrays", "errors", "symbolic"},
     "precond_worker.factorization": {"arrays", "errors", "gpu", "symbolic"},
-    "precond_worker.network": {"errors", "pool_choice", "remote_assembly"},
+    "precond_worker.network": {"errors", "remote_assembly"},
     "clients.accuracy": {"errors", "load_test", "log", "progress", "watch"},
     "clients.demo": {"client", "errors", "grab", "load_test", "log"},
     "clients.examples": {"client", "errors", "grab", "log"},

@@ -115,7 +115,8 @@ class Search:
         """Makes a run and keeps it; returns why it failed, or nothing."""
         study, states = self._study, self._optuna.trial.TrialState
         study.sampler = self._optuna.samplers.TPESampler(seed=self.seed + self._number)
-        if shares is not None:
+        waits = study.get_trials(deepcopy=False, states=(states.WAITING,))  # of one that was killed before it began
+        if shares is not None and not waits:
             given = {f.key: f.value(share) for f, share in zip(self.fits, shares.tolist(), strict=True)}
             study.enqueue_trial(given)
         trial = study.ask(self._space)

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from protocol.channels import CHANNELS, PROTOCOL, key
 from protocol.counters import Counters
-from protocol.factor_parts import Bytes, bytes_of, part, part_checksums, part_count
 from protocol.messages_pb2 import FactorPart, Header
+from protocol.network.factor_parts import Bytes, bytes_of, part, part_checksums, part_count
 from protocol.network.session import Session
 from protocol.refused import Refused
 from protocol.shared_memory.view import SlotMap

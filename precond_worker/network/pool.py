@@ -13,8 +13,8 @@ from collections.abc import Callable, Mapping
 
 import zenoh
 
+from precond_worker.network.pool_choice import LEAST, PoolChoice, ServerNeed
 from precond_worker.network.trust import Sent, Speakers, Trust
-from precond_worker.pool_choice import LEAST, PoolChoice, ServerNeed
 from protocol.channels import CHANNELS, key, name_in, server_in
 from protocol.counters import Counters
 from protocol.messages_pb2 import Need

@@ -9,6 +9,7 @@ of its own (fill_process.py), as it leaves files where it runs.
 Source: Hu, Schneider, Wang, Zorin, Panozzo, Fast Tetrahedral Meshing in the Wild, 2020.
 """
 
+import contextlib
 import hashlib
 import logging
 import os
@@ -68,10 +69,10 @@ def filled(path: str | Path, edge: float, envelope: float | None = None, scale: 
     said = f"{len(tets)} tetrahedra in {_parts(mesh)}, {mesh.volumes.sum():.4g} m3"
     told = _compared(points, triangles, float(mesh.volumes.sum()))
     if made:
-        _keep(kept, rest, tets)
         log.warning(
             "mesh %s: filled with %s, in %.1f s; kept as %s", path.name, said, time.perf_counter() - begun, kept
         )
+        mesh = mesh_of(*_keep(kept, rest, tets), name=path.name)
     if told:
         log.warning("mesh %s: %s", path.name, told)
     return mesh
@@ -164,12 +165,24 @@ def _from_cache(path: Path) -> tuple[Float64, Int32] | None:
         return None
 
 
-def _keep(path: Path, rest: Float64, tets: Int32) -> None:
-    """Writes a mesh as a whole or not at all; without a folder to write to it is made each time."""
+def _keep(path: Path, rest: Float64, tets: Int32) -> tuple[Float64, Int32]:
+    """Writes a mesh as a whole or not at all; without a folder to write to it is made each time.
+
+    Returns what is kept: where several processes fill a surface at a time, the mesh of the first one for all.
+    """
     part = path.with_suffix(f".{os.getpid()}.npz")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         np.savez_compressed(part, rest=rest, tets=tets)
-        part.replace(path)
+        try:
+            os.link(part, path)
+        except OSError:  # it is there, or the file system knows no links
+            if (found := _from_cache(path)) is not None:
+                return found
+            part.replace(path)
     except OSError as error:
         log.warning("mesh %s: cannot be kept in %s (%s)", path.stem, path.parent, error.strerror or error)
+    finally:
+        with contextlib.suppress(OSError):
+            part.unlink(missing_ok=True)
+    return rest, tets

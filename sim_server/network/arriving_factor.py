@@ -3,7 +3,7 @@
 
 import numpy as np
 
-from protocol.factor_parts import Bytes, bytes_of, part, part_count
+from protocol.network.factor_parts import Bytes, bytes_of, part, part_count
 from protocol.process.memory import available_memory
 from protocol.refused import Refused
 from protocol.validate import checksum

@@ -66,6 +66,27 @@ def test_a_search_that_was_interrupted_goes_on_as_if_it_had_not(tmp_path: Path) 
     assert seen["parts"] == seen["whole"] and parts == whole
 
 
+def test_a_search_that_was_killed_before_a_run_began_goes_on_with_it(tmp_path: Path) -> None:
+    attempt, known = attempt_for(swing, young=4.4e4, damping=1.7), [YOUNG, DAMPING]
+    seen: dict[str, list[dict[str, float]]] = {"whole": [], "parts": []}
+
+    def noted(name: str) -> Attempt:
+        return lambda values: (seen[name].append(values), attempt(values))[1]
+
+    Search(tmp_path / "whole", known, 0, "q").run(noted("whole"), 8)
+    killed = Search(tmp_path / "parts", known, 0, "q")
+    killed.run(noted("parts"), 2)
+
+    def ask(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    killed._study.ask = ask  # type: ignore[method-assign,assignment]
+    with pytest.raises(KeyboardInterrupt):
+        killed.run(noted("parts"), 8)
+    Search(tmp_path / "parts", known, 0, "q").run(noted("parts"), 8)
+    assert seen["parts"] == seen["whole"]
+
+
 def test_runs_that_fail_are_left_out(tmp_path: Path) -> None:
     """Beyond a value the run diverges; the answer is on the other side."""
     good = attempt_for(lambda young: 1 / young * TIMES, young=2e4)

@@ -15,8 +15,8 @@ from precond_worker.network import offered_factors
 from precond_worker.network.offered_factors import OfferedFactors
 from protocol.channels import PROTOCOL
 from protocol.counters import Counters
-from protocol.factor_parts import bytes_of, part, part_checksums
 from protocol.messages_pb2 import FactorPart, Header
+from protocol.network.factor_parts import bytes_of, part, part_checksums
 from protocol.refused import Refused
 from sim_server.network import arriving_factor, factor_fetch
 from sim_server.network.arriving_factor import ArrivingFactor

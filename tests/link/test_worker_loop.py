@@ -17,9 +17,9 @@ from precond_worker.worker import Worker
 from protocol.channels import PROTOCOL, key
 from protocol.counters import Counters
 from protocol.factor import FactorPattern
-from protocol.factor_parts import bytes_of, part_checksums
 from protocol.messages_pb2 import Factor, Header, Matrix, Scene, Topology
 from protocol.method import Method
+from protocol.network.factor_parts import bytes_of, part_checksums
 from protocol.refused import Refused
 from protocol.shared_memory.view import SlotMap
 from protocol.validate import check_header, checksum

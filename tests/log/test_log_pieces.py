@@ -20,8 +20,9 @@ from protocol.log_chunks import BadLog
 from protocol.log_file import LogFile
 from protocol.log_pieces import later_pieces, size_of_log
 from sim_server.errors import InputError
+from sim_server.recording.pieces import Pieces
 from sim_server.recording.recorder import Recorder
-from sim_server.recording.rotation import Rotation
+from sim_server.recording.rotation import Kept, Rotation
 
 NODES = 20
 TETS = np.arange(4 * 5, dtype="<i4").reshape(5, 4)
@@ -145,8 +146,8 @@ def test_time_begins_a_new_file_and_an_idle_log_none(tmp_path: Path, monkeypatch
     path = tmp_path / "idle.mcap"
     looks = []
     with Recorder(path, rotation=due) as recorder:
-        keep = recorder._pieces._kept.keep_budget
-        monkeypatch.setattr(recorder._pieces._kept, "keep_budget", lambda size: looks.append(keep(size)))
+        keep = Kept.keep_budget
+        monkeypatch.setattr(Kept, "keep_budget", lambda kept, size: looks.append(keep(kept, size)))
         begin(recorder)
         until(lambda: recorder.written == 2)
         Due.now = True
@@ -272,8 +273,8 @@ def test_files_of_an_earlier_log_are_replaced_and_others_are_not(tmp_path: Path)
 def test_a_removed_file_is_told_and_a_new_one_begun(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path, told = tmp_path / "run.mcap", []
     with Recorder(path, report=told.append) as recorder:
-        may_go_on, room = recorder._pieces.may_go_on, threading.Event()
-        monkeypatch.setattr(recorder._pieces, "may_go_on", lambda first: room.is_set() and may_go_on(first))
+        may_go_on, room = Pieces.may_go_on, threading.Event()
+        monkeypatch.setattr(Pieces, "may_go_on", lambda pieces, first: room.is_set() and may_go_on(pieces, first))
         begin(recorder)
         steps(recorder, 1, 5)
         until(lambda: recorder.written == 17)

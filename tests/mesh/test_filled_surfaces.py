@@ -61,6 +61,25 @@ def test_a_mesh_is_made_once_for_a_surface_and_its_options(tmp_path, cache, fill
     assert len(filled_with_tets) == 4
 
 
+def test_processes_that_fill_a_surface_at_a_time_have_the_same_mesh(tmp_path, cache, filled_with_tets, monkeypatch):
+    """As of a sweep: another one has kept its mesh while this one was filling, which gives another each time."""
+    write(tmp_path / "block.stl")
+    stands_in, others = fill.tetrahedra_inside, []
+
+    def beside(*given):
+        if not others:
+            others.append(None)
+            others[0] = fill.filled(tmp_path / "block.stl", 0.1)
+        rest, tets = stands_in(*given)
+        return rest * (1 + 1e-3 * (len(others) == 1 and others[0] is not None)), tets
+
+    monkeypatch.setattr(fill, "tetrahedra_inside", beside)
+    mine = fill.filled(tmp_path / "block.stl", 0.1)
+    np.testing.assert_array_equal(mine.rest, others[0].rest)
+    np.testing.assert_array_equal(mine.rest, fill.filled(tmp_path / "block.stl", 0.1).rest)
+    assert len(list(cache.iterdir())) == 1
+
+
 def test_volumes_of_surface_and_mesh_are_compared(tmp_path, filled_with_tets, caplog):
     """Of a closed surface, one wound inwards, one with a hole, and one that encloses more than is filled."""
 

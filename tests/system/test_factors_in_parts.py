@@ -14,8 +14,8 @@ from hand_worker import HandWorker
 from link_helpers import Driver, chain, dense, free_endpoint, light_worker, matrix, product
 
 from protocol.channels import PROTOCOL, key
-from protocol.factor_parts import bytes_of, part, part_checksums
 from protocol.messages_pb2 import Factor, FactorPart, Header, Matrix
+from protocol.network.factor_parts import bytes_of, part, part_checksums
 from protocol.network.session import open_session
 from protocol.shared_memory import limits as shm_limits
 from sim_server.network import dispatch, factor_fetch

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from precond_worker.pool_choice import MARGIN, REST, PoolChoice, ServerNeed
+from precond_worker.network.pool_choice import MARGIN, REST, PoolChoice, ServerNeed
 
 PERIOD = 0.5  # s between two needs that a server tells
 

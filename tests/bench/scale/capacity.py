@@ -5,7 +5,7 @@ import time
 from typing import Any
 
 from precond_worker.network.pool import read_need
-from precond_worker.pool_choice import PoolChoice, ServerNeed
+from precond_worker.network.pool_choice import PoolChoice, ServerNeed
 from protocol.channels import PROTOCOL
 from protocol.messages_pb2 import Header, Need
 from sim_server.mesh import bar

@@ -45,8 +45,8 @@ a core each, in {plan.pools} pools and {plan.racks} racks. Each rack has a route
 at {plan.link * 8e-9:g} Gbit/s. In {100 * plan.touched:g} % of the servers, at a time, a body is in a hand, for
 {plan.held:g} s on average. Times are those of the tables above; the worker's first job of a server since it took it
 costs the analysis, too. Events are a matrix copied, sent, factorized, sent back and used from the next step on; a
-server publishes its need and a worker looks at needs as in the product, by the very module
-(precond_worker/pool_choice.py). {plan.seconds:g} s are simulated, the first {plan.warm:g} s do not count. Nothing but
+server publishes its need and a worker looks at needs as in the product, by the very module (network/pool_choice.py of
+precond_worker). {plan.seconds:g} s are simulated, the first {plan.warm:g} s do not count. Nothing but
 the seed decides: figures of this part repeat to the digit.
 
 Iterations above those with a fresh factor grow with its age: in a hand by {moving.slope:.3g} for each step of age,

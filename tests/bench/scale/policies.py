@@ -5,7 +5,7 @@ import random
 from collections.abc import Mapping, Sequence
 from typing import Protocol
 
-from precond_worker.pool_choice import REST, PoolChoice, ServerNeed
+from precond_worker.network.pool_choice import REST, PoolChoice, ServerNeed
 
 
 class Choice(Protocol):

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from precond_worker.main_loop import POOL_PERIOD
-from precond_worker.pool_choice import ServerNeed
+from precond_worker.network.pool_choice import ServerNeed
 from sim_server.mesh import bar
 from sim_server.service.need import MEMORY, PERIOD
 from tests.bench.scale.measured import Body, body, dragged, resting
