@@ -35,7 +35,8 @@ iterations grow with the age of the factor, and copies matrices; the worker, a p
 at once with the factor that it has made of it before. Driver, network, shared memory, checks and mailboxes are the
 product's. *us a factor*: processor time of the service thread, all that it does in its rounds but for the stand-in,
 over the factors that the loop was given. *calls a factor*: calls of Python functions in it, which do not depend on the
-machine. *busy*: part of the time in which the thread has a processor. Age: of the factor of a solve [steps]. Several
+machine. *busy*: part of the time in which the thread has a processor. Age: of the factor of a solve [steps],
+from when every beam has had one: the oldest are of beams that waited for the others meanwhile. Several
 rounds of one size follow one another; the median by *us a factor* is shown, and the least and largest beside it."""
 
 Row = dict[str, Any]
