@@ -83,7 +83,7 @@ class Dispatch(FactorSource):
         self._registry = WorkerRegistry(incarnation, silence)
         self.leases = Leases(pool)
         self._timing = WorkerTiming()
-        self._reliability = WorkerReliability()
+        self.reliability = WorkerReliability()
         self._lock = threading.RLock()  # a status lists the workers while the loop thread takes in a factor
         self._last_worker: dict[str, str] = {}  # by object: the worker that knows its pattern already
         self._free_since: dict[str, float] = {}  # by worker, time of its last answer
@@ -92,7 +92,7 @@ class Dispatch(FactorSource):
         self._fast_links: set[str] = set()  # workers without shared memory whose link takes a job at once
         self._thread = ThreadPoolExecutor(1, "large factors")
         self._fetching = ThreadPoolExecutor(FETCHES, "parts of factors")
-        self._decoding: list[AnsweredJob] = []
+        self.decoding: list[AnsweredJob] = []
         self._factors: list[Factor] = []
         self._failures: list[tuple[str, str]] = []
         self._patterns: list[tuple[str, FactorPattern]] = []
@@ -115,7 +115,7 @@ class Dispatch(FactorSource):
             self.decoder.announce(topology)
             self.leases.forget_object(topology.header.object)
             self._timing.forget_object(topology.header.object)
-            self._reliability.forget_object(topology.header.object)
+            self.reliability.forget_object(topology.header.object)
 
     def epoch(self, name: str) -> int | None:
         """Returns the epoch of an object that was announced last; jobs of others are refused."""
@@ -191,7 +191,7 @@ class Dispatch(FactorSource):
     def reserved(self) -> set[str]:
         """Objects that are better left for a busy worker, since factors by the idle ones failed."""
         with self._lock:
-            failing = self._reliability.failing_objects
+            failing = self.reliability.failing_objects
             if not failing:
                 return set()
             idle, available = self._open(), self._available()
@@ -200,19 +200,19 @@ class Dispatch(FactorSource):
     def consecutive_failures(self) -> dict[str, int]:
         """Jobs in a row that failed at the best worker of each object."""
         with self._lock:
-            failing = self._reliability.failing_objects
+            failing = self.reliability.failing_objects
             available = self._available() if failing else []
-            return {object: self._reliability.consecutive_failures(available, object) for object in failing}
+            return {object: self.reliability.consecutive_failures(available, object) for object in failing}
 
     def factor_failed(self, worker: str, object: str) -> None:
         """Notes that a factor made by `worker` was rejected, or that solves had to abandon it."""
         with self._lock:
-            self._reliability.on_failure(worker, object, self._clock())
+            self.reliability.on_failure(worker, object, self._clock())
 
     def factor_helped(self, worker: str, object: str) -> None:
         """Notes that a solve converged with a factor made by `worker`."""
         with self._lock:
-            self._reliability.on_success(worker, object)
+            self.reliability.on_success(worker, object)
 
     # ---- jobs to workers -------------------------------------------------------------------------------------
 
@@ -259,7 +259,7 @@ class Dispatch(FactorSource):
         if job.object in self.leases.by_object:
             return None
         able = [name for name in idle if not job.positions or self._assembles(name)]
-        if self._reliability.failing_objects:
+        if self.reliability.failing_objects:
             able = self._candidates(able, self._available(), job.object)
         return self._choose(able, job.object, rooms) if able else None
 
@@ -315,7 +315,7 @@ class Dispatch(FactorSource):
     def _on_sent(self, worker: str, jobs: Sequence[Job]) -> None:
         for job in jobs:
             self._last_worker[job.object] = worker
-        self._reliability.on_sent(worker, self._clock())
+        self.reliability.on_sent(worker, self._clock())
         self._counters.add("jobs", len(jobs))
         self._counters.add("bytes_out", sum(job.values.nbytes for job in jobs))
 
@@ -385,7 +385,7 @@ class Dispatch(FactorSource):
         """Available workers with room for a job."""
         available, now = self._available(), self._clock()
         free = [name for name in available if self._room(name) > 0]
-        return [name for name in free if self._reliability.may_get_job(name, available, now)]
+        return [name for name in free if self.reliability.may_get_job(name, available, now)]
 
     def _room(self, worker: str) -> int:
         """Number of jobs that a worker can take beside those it has.
@@ -402,13 +402,13 @@ class Dispatch(FactorSource):
 
     def _waiting(self, worker: str) -> int:
         """Number of jobs that a worker has not done yet; those whose parts are fetched are done."""
-        fetched = sum(each.job.worker == worker for each in self._decoding if each.fetch is not None)
+        fetched = sum(each.job.worker == worker for each in self.decoding if each.fetch is not None)
         return self.leases.count(worker) - fetched
 
     def _candidates(self, idle: list[str], available: list[str], object: str) -> list[str]:
         """Idle workers that are not suspended for the object; all idle ones if all available workers are."""
         now = self._clock()
-        good = [name for name in available if not self._reliability.is_suspended(name, object, now)]
+        good = [name for name in available if not self.reliability.is_suspended(name, object, now)]
         return [name for name in idle if name in good] if good else idle
 
     def _has_candidates(self, job: InFlightJob) -> bool:
@@ -520,7 +520,7 @@ class Dispatch(FactorSource):
 
     def _on_expired(self, job: InFlightJob, why: str) -> None:
         self._fast_links.discard(job.worker)  # zenoh may have dropped the job
-        self._reliability.on_failure(job.worker, job.object, self._clock())
+        self.reliability.on_failure(job.worker, job.object, self._clock())
         self._fail(job, why)
 
     def _query_tokens(self) -> None:
@@ -551,7 +551,7 @@ class Dispatch(FactorSource):
     def _remove_worker(self, name: str) -> None:
         lost = self.leases.remove_worker(name)
         self._timing.forget_worker(name)
-        self._reliability.forget_worker(name)
+        self.reliability.forget_worker(name)
         self._fast_links.discard(name)
         self._free_since.pop(name, None)
         self._answered_at.pop(name, None)
@@ -569,7 +569,7 @@ class Dispatch(FactorSource):
         now = self._clock()
         self._registry.mark_seen(job.worker, now)
         self._free_since[job.worker] = now
-        self._reliability.on_answer(job.worker)
+        self.reliability.on_answer(job.worker)
         if self.leases.is_reassigned(job):
             return self.leases.finish(job, None if message.failure else message.seconds)
         if message.parts and not message.failure:
@@ -577,7 +577,7 @@ class Dispatch(FactorSource):
         decode = partial(self.decoder.decode, message, sample.payload, job)
         if not message.failure and 4 * message.nonzeros > LARGE:  # its bytes are copied and checked beside the caller
             self._refuse_second(job)
-            self._decoding.append(AnsweredJob(message, job, self._thread.submit(decode)))
+            self.decoding.append(AnsweredJob(message, job, self._thread.submit(decode)))
             return
         self._take_factor(job, decode, message.failure, message.seconds, _slots_used(message))
 
@@ -594,7 +594,7 @@ class Dispatch(FactorSource):
                 if duration is None:
                     duration = self._duration(job, now) / len(message.jobs)
                     self._free_since[worker] = now
-                    self._reliability.on_answer(worker)
+                    self.reliability.on_answer(worker)
                 if self.leases.is_reassigned(job):
                     self.leases.finish(job, None if failure else message.seconds[place])
                     continue
@@ -617,7 +617,7 @@ class Dispatch(FactorSource):
             self._session, self._server, self._incarnation, self._counters, job, message.nonzeros, message.parts, slots
         )
         decode = partial(self.decoder.decode, message, b"", job, fetch.run)
-        self._decoding.append(AnsweredJob(message, job, self._fetching.submit(decode), fetch))
+        self.decoding.append(AnsweredJob(message, job, self._fetching.submit(decode), fetch))
 
     def _give_back(self, slots: Sequence[Slot], clean: bool = True) -> None:
         """Frees the slots of a fetch. clean: nobody writes to them any more."""
@@ -631,23 +631,23 @@ class Dispatch(FactorSource):
 
     def _is_decoded(self, job: InFlightJob) -> bool:
         """True while the answer to a job is taken in beside the caller."""
-        return any(each.job.number == job.number for each in self._decoding)
+        return any(each.job.number == job.number for each in self.decoding)
 
     def _is_arriving(self, job: InFlightJob) -> bool:
         """True while the answer to a job is taken in, unless it comes in parts and none comes any more."""
         return any(
             each.job.number == job.number and not (each.fetch is not None and each.fetch.stalls)
-            for each in self._decoding
+            for each in self.decoding
         )
 
     def _take_decoded(self) -> None:
         """Takes the large factors that were decoded beside the caller, unless their jobs are over."""
-        for each in self._decoding:
+        for each in self.decoding:
             if each.fetch is not None and self.leases.by_object.get(each.job.object) is not each.job:
                 each.fetch.give_up()
-        done = [each for each in self._decoding if each.factor.done()]
+        done = [each for each in self.decoding if each.factor.done()]
         for each in done:
-            self._decoding.remove(each)
+            self.decoding.remove(each)
             message, job, factor, fetch = each
             if fetch is not None:
                 self._give_back(fetch.slots, fetch.clean)
@@ -668,7 +668,7 @@ class Dispatch(FactorSource):
         """Frees the worker of a job that is over, if it is still there."""
         if self.leases.by_worker.get(job.worker, {}).get(job.number) is job:
             if self.leases.is_reassigned(job):  # its parts did not come
-                self._reliability.on_failure(job.worker, job.object, self._clock())
+                self.reliability.on_failure(job.worker, job.object, self._clock())
             self.leases.finish(job)
 
     def _take_factor(
@@ -685,14 +685,14 @@ class Dispatch(FactorSource):
         try:
             if failure:
                 self._counters.add("failures")
-                self._reliability.on_failure(job.worker, job.object, now)
+                self.reliability.on_failure(job.worker, job.object, now)
                 return self._fail(job, f"failed: {failure[:500]}")
             self._factors.append(decode())
             seconds = told
             lasted = self._duration(job, now) if duration is None else duration
             self._timing.record(job.worker, job.object, lasted, seconds)
         except Refused as refusal:
-            self._reliability.on_failure(job.worker, job.object, now)
+            self.reliability.on_failure(job.worker, job.object, now)
             self._fail(job, f"was refused: {refusal}")
             raise
         finally:
