@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from sim_server.scene.model import Scene
 from sim_server.simulation import Simulation
 from sim_server.updates.driver import Driver
-from tests.hard_cases.running import STATUS, Beside, quiet
+from tests.hard_cases.running import STATUS, Beside, quiet, solved
 
 Table = dict[str, Any]
 Reals = NDArray[np.float64]
@@ -107,10 +107,10 @@ def run_effect_case(
     ]  # fmt: skip
     if not value <= case.most:
         wrong.append(f"{value:.3g}, more than {case.most:g}")
-    solved = trace.records["residual"][trace.records["status"] == 0]
+    residuals = trace.records["residual"][solved(trace.records)]
     return EffectOutcome(
         tuple(wrong), value, status, trace.records["iterations"].astype(float), *_shape(sim, trace),
-        float(solved.max(initial=0.0)), easy.cost(records) if easy else None,
+        float(residuals.max(initial=0.0)), easy.cost(records) if easy else None,
     )  # fmt: skip
 
 

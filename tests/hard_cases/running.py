@@ -51,7 +51,7 @@ class Outcome:
     upright: int | None  # step from which every det F > 0
     named: int = 0  # elements that were refused
     volume: tuple[float, float] = (1.0, 1.0)  # least and largest V / V0 of the run
-    residual: float = 0.0  # largest true one of a step that says converged
+    residual: float = 0.0  # largest true one of a step that says converged, and not at rest
     curve: tuple[float, ...] = ()  # the distance at steps spread over the run, CURVE of them
     home: float = math.nan  # distance at the end from where the scene begins
     cost: tuple[float, float] | None = None  # time and iterations of its steps over those of the case made easy
@@ -165,7 +165,8 @@ class Beside:
     def cost(self, records: list[NDArray[Any]]) -> tuple[float, float]:
         """Time (of the loop's processor, or of a GPU) and iterations of steps over those made here."""
         own, easy = np.concatenate(records), np.concatenate(self._records)
-        time, iterations = (float(own[name].sum() / easy[name].sum()) for name in (self._clock, "iterations"))
+        sums = [(float(own[name].sum()), float(easy[name].sum())) for name in (self._clock, "iterations")]
+        time, iterations = (mine / other if other else math.nan for mine, other in sums)
         return time, iterations
 
 
@@ -281,6 +282,11 @@ def _goal(case: Case, sim: Simulation, place: Place) -> Reals:
     return sim.world.x.copy()
 
 
+def solved(records: Any) -> NDArray[np.bool_]:
+    """Steps that were solved: that of a body at rest has the residual of rounding."""
+    return np.asarray((records["status"] == STATUS.index("converged")) & (records["at_rest"] == 0))
+
+
 def _from_then_on(good: NDArray[np.bool_]) -> int | None:
     """First step (counted from 1) from which it holds to the end; 0: always."""
     bad = np.flatnonzero(~good)
@@ -307,7 +313,7 @@ def _outcome(case: Case, sim: Simulation, records: Any, energy: Reals, distance:
         recovered=_from_then_on(distance <= case.within),
         lowest=float(det.min()),
         upright=_from_then_on(det > 0),
-        residual=float(records["residual"][records["status"] == 0].max(initial=0.0)),
+        residual=float(records["residual"][solved(records)].max(initial=0.0)),
     )
 
 

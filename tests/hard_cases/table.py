@@ -19,6 +19,11 @@ SEVERAL = (
     "law may keep so (as of random starts at Poisson's ratio 0.45, below): then the last of what must hold does not."
 )
 
+JUMPS = (
+    " Rotations of elements that turn back jump: in one of five seeds energy rises by 1.5e-5 of what is dissipated, "
+    "and not at all with half the time step."
+)
+
 MATERIAL = [
     Case("stiffness 1 : 1e-3 : 1e-6", "bands along Z, stiffest at the held end; hangs under gravity",
          (GRAVITY, young(("Z < 1.3", 1e11), ("Z < 2.7", 1e8), ("true", 1e5))), rests="static", steps=600,
@@ -50,7 +55,7 @@ STARTS = [
          recovered=700),
     Case("inside out, symmetric mesh", "as before on a mesh that is its own mirror image",
          ('object.bar.mesh={ bar = [4, 4, 12], size = [1, 1, 4], split = "mirrored" }',), start=starts.mirrored(0),
-         steps=800, rests="still", recovered=700, several=True, note=SEVERAL),
+         steps=800, rests="still", recovered=700, energy=1e-4, several=True, note=SEVERAL + JUMPS),
     Case("swapped layers", "layers of nodes change places in pairs", start=starts.swapped_layers, steps=800,
          recovered=700),
     Case("flat", "all nodes in the plane Y = 0.5 m, noise 1 um", start=starts.flattened(1), steps=800,

@@ -298,7 +298,7 @@ def test_what_never_completes_is_dropped_with_the_reason(
         hand.answer(answer)
         driver.until(lambda: driver.failures, "the refusal")
         assert "was refused" in driver.failures[0][1] and told in driver.failures[0][1]
-        assert driver.factors == [] and link.dispatch.decoding == [] and link.slots_lent == 0
+        assert driver.factors == [] and not link.dispatch.decoding and link.slots_lent == 0
         driver.submit(BEAM, 2)
         answer, values = hand.right_answer(hand.receive(), BEAM)
         hand.answer(answer, values)  # whole, as an older worker does

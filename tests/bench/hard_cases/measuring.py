@@ -93,12 +93,9 @@ def _measured(job: Job, device: str, folder: Path) -> Row:
         found = run_long(entry, 1000 if job.quick else entry.steps)
         return {"steps": 1000 if job.quick else entry.steps, "wrong": "; ".join(found.wrong(entry)), **vars(found)}
     case = of_precision(seeded(entry, job.seed), job.precision)
-    return _of_case(
-        case,
-        run_case(
-            finer(case) if job.finer else case, folder, device, job.precision, compare=job.seed == 0 and not job.finer
-        ),
-    )
+    case = finer(case) if job.finer else case
+    compare = job.seed == 0 and not job.finer
+    return _of_case(case, run_case(case, folder, device, job.precision, compare=compare))
 
 
 def _of_case(case: Case, out: Outcome) -> Row:

@@ -94,7 +94,8 @@ def _solves(rows: list[Row]) -> Row:
 
 def _cost(rows: list[Row]) -> str:
     """Of the seed that was run beside the scene made easy."""
-    return next((f"{cost[0]:.1f} / {cost[1]:.1f}" for row in rows if (cost := row.get("cost"))), "–")
+    cost = next((row["cost"] for row in rows if row.get("cost")), None)
+    return " / ".join(_number(part, ".1f") for part in cost) if cost else "–"
 
 
 def case_row(case: Case, found: Found, kind: str) -> Row:
