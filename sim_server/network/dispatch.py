@@ -39,6 +39,7 @@ TOKEN_QUERY_INTERVAL = 1.0  # s between queries for tokens of workers that send 
 FAST_SEND = 0.05  # s in which a fast link takes a job as bytes; zenoh drops what is not taken within 0.25 s
 MAX_NEW_PATTERNS = 256  # that wait to be prepared for; older ones are prepared for when their factors come
 SMALL_BLOCKS = 20_000  # of the largest matrix, if several jobs may wait at a worker
+BEHIND = 10.0  # s of a lease, at most, for what waits at a worker behind a first job, which has a longer one
 MOST_ALONE = 32  # jobs in flight at a worker while they go alone, each with slots of its own, which are slow to make
 QUEUE_SECONDS = 0.02  # s of factorizations that wait at a worker at most
 LOOK_PERIOD = 1e-3  # s between looks at which leases are over
@@ -372,7 +373,7 @@ class Dispatch(FactorSource):
             job.warp,
             np.dtype(job.dtype).name,
             worker,
-            deadline=max(now + lease, self.leases.deadlines().get(worker, 0.0)),  # it may wait behind a first job
+            deadline=now + max(lease, min(self.leases.deadlines().get(worker, 0.0) - now, BEHIND)),
             factor_slot=factor_slot,
             factor_generation=factor_slot.generation if factor_slot else 0,
             slots=slots,
