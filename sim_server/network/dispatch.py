@@ -93,7 +93,7 @@ class Dispatch(FactorSource):
         self._registry = WorkerRegistry(incarnation, silence)
         self.leases = Leases(pool)
         self._timing = WorkerTiming()
-        self._reliability = WorkerReliability()
+        self.reliability = WorkerReliability()
         self._lock = threading.RLock()  # a status lists the workers while the loop thread takes in a factor
         self._last_worker: dict[str, str] = {}  # by object: the worker that knows its pattern already
         self._free_since: dict[str, float] = {}  # by worker, time of its last answer
@@ -102,7 +102,7 @@ class Dispatch(FactorSource):
         self._fast_links: set[str] = set()  # workers without shared memory whose link takes a job at once
         self._thread = ThreadPoolExecutor(1, "large factors")
         self._fetching = ThreadPoolExecutor(FETCHES, "parts of factors")
-        self._decoding: dict[int, Decoding] = {}  # by number of the job
+        self.decoding: dict[int, Decoding] = {}  # by number of the job
         self._fetches: set[int] = set()  # of these, the jobs whose factors come in parts
         self._factors: list[Factor] = []
         self._failures: list[tuple[str, str]] = []
@@ -126,7 +126,7 @@ class Dispatch(FactorSource):
             self.decoder.announce(topology)
             self.leases.forget_object(topology.header.object)
             self._timing.forget_object(topology.header.object)
-            self._reliability.forget_object(topology.header.object)
+            self.reliability.forget_object(topology.header.object)
 
     def epoch(self, name: str) -> int | None:
         """Returns the epoch of an object that was announced last; jobs of others are refused."""
@@ -202,7 +202,7 @@ class Dispatch(FactorSource):
     def reserved(self) -> set[str]:
         """Objects that are better left for a busy worker, since factors by the idle ones failed."""
         with self._lock:
-            failing = self._reliability.failing_objects
+            failing = self.reliability.failing_objects
             if not failing:
                 return set()
             idle, available = self._open(), self._available()
@@ -211,19 +211,19 @@ class Dispatch(FactorSource):
     def consecutive_failures(self) -> dict[str, int]:
         """Jobs in a row that failed at the best worker of each object."""
         with self._lock:
-            failing = self._reliability.failing_objects
+            failing = self.reliability.failing_objects
             available = self._available() if failing else []
-            return {object: self._reliability.consecutive_failures(available, object) for object in failing}
+            return {object: self.reliability.consecutive_failures(available, object) for object in failing}
 
     def factor_failed(self, worker: str, object: str) -> None:
         """Notes that a factor made by `worker` was rejected, or that solves had to abandon it."""
         with self._lock:
-            self._reliability.on_failure(worker, object, self._clock())
+            self.reliability.on_failure(worker, object, self._clock())
 
     def factor_helped(self, worker: str, object: str) -> None:
         """Notes that a solve converged with a factor made by `worker`."""
         with self._lock:
-            self._reliability.on_success(worker, object)
+            self.reliability.on_success(worker, object)
 
     # ---- jobs to workers -------------------------------------------------------------------------------------
 
@@ -271,7 +271,7 @@ class Dispatch(FactorSource):
         if job.object in self.leases.by_object:
             return None
         able = [name for name in idle if not job.positions or self._assembles(name)]
-        if self._reliability.failing_objects:
+        if self.reliability.failing_objects:
             able = self._candidates(able, self._available(), job.object)
         return self._choose(able, job.object, rooms) if able else None
 
@@ -324,7 +324,7 @@ class Dispatch(FactorSource):
     def _on_sent(self, worker: str, jobs: Sequence[Job]) -> None:
         for job in jobs:
             self._last_worker[job.object] = worker
-        self._reliability.on_sent(worker, self._clock())
+        self.reliability.on_sent(worker, self._clock())
         self._counters.add("jobs", len(jobs))
         self._counters.add("bytes_out", sum(job.values.nbytes for job in jobs))
 
@@ -394,7 +394,7 @@ class Dispatch(FactorSource):
         """Available workers with room for a job."""
         available, now = self._available(), self._clock()
         free = [name for name in available if self._room(name) > 0]
-        return [name for name in free if self._reliability.may_get_job(name, available, now)]
+        return [name for name in free if self.reliability.may_get_job(name, available, now)]
 
     def _room(self, worker: str) -> int:
         """Number of jobs that a worker can take beside those it has.
@@ -412,13 +412,13 @@ class Dispatch(FactorSource):
 
     def _waiting(self, worker: str) -> int:
         """Number of jobs that a worker has not done yet; those whose parts are fetched are done."""
-        fetched = sum(self._decoding[number].job.worker == worker for number in self._fetches)
+        fetched = sum(self.decoding[number].job.worker == worker for number in self._fetches)
         return self.leases.count(worker) - fetched
 
     def _candidates(self, idle: list[str], available: list[str], object: str) -> list[str]:
         """Idle workers that are not suspended for the object; all idle ones if all available workers are."""
         now = self._clock()
-        good = [name for name in available if not self._reliability.is_suspended(name, object, now)]
+        good = [name for name in available if not self.reliability.is_suspended(name, object, now)]
         return [name for name in idle if name in good] if good else idle
 
     def _has_candidates(self, job: InFlightJob) -> bool:
@@ -526,11 +526,11 @@ class Dispatch(FactorSource):
             self._on_expired(job, f"was lost: worker {job.worker} says that it has no job")
 
     def _sent_at(self, job: InFlightJob) -> float:
-        return float("inf") if job.number in self._decoding else self._sent.get(job.number, float("inf"))
+        return float("inf") if job.number in self.decoding else self._sent.get(job.number, float("inf"))
 
     def _on_expired(self, job: InFlightJob, why: str) -> None:
         self._fast_links.discard(job.worker)  # zenoh may have dropped the job
-        self._reliability.on_failure(job.worker, job.object, self._clock())
+        self.reliability.on_failure(job.worker, job.object, self._clock())
         self._fail(job, why)
 
     def _query_tokens(self) -> None:
@@ -561,7 +561,7 @@ class Dispatch(FactorSource):
     def _remove_worker(self, name: str) -> None:
         lost = self.leases.remove_worker(name)
         self._timing.forget_worker(name)
-        self._reliability.forget_worker(name)
+        self.reliability.forget_worker(name)
         self._fast_links.discard(name)
         self._free_since.pop(name, None)
         self._answered_at.pop(name, None)
@@ -579,7 +579,7 @@ class Dispatch(FactorSource):
         now = self._clock()
         self._registry.mark_seen(job.worker, now)
         self._free_since[job.worker] = now
-        self._reliability.on_answer(job.worker)
+        self.reliability.on_answer(job.worker)
         if self.leases.is_reassigned(job):
             return self.leases.finish(job, None if message.failure else message.seconds)
         if message.parts and not message.failure:
@@ -589,7 +589,7 @@ class Dispatch(FactorSource):
             self._refuse_second(job)
             future = self._thread.submit(decode)
             made = Decoding(job, future, future.result, message.seconds, _slots_used(message))
-            self._decoding[job.number] = made
+            self.decoding[job.number] = made
             return
         self._take_factor(job, decode, message.failure, message.seconds, _slots_used(message))
 
@@ -606,7 +606,7 @@ class Dispatch(FactorSource):
                 if not duration:
                     duration = self._duration(job, now) / len(message.jobs)
                     self._free_since[worker] = now
-                    self._reliability.on_answer(worker)
+                    self.reliability.on_answer(worker)
                 if self.leases.is_reassigned(job):
                     self.leases.finish(job)
                 elif failure := message.failures[place] if message.failures else "":
@@ -614,7 +614,7 @@ class Dispatch(FactorSource):
                 elif not large:
                     decode, told = partial(self.decoder.decode_one, message, place, job), message.seconds[place]
                     self._take_factor(job, decode, "", told, (message.matrix_shared, True), duration)
-                elif number in self._decoding or number in beside:
+                elif number in self.decoding or number in beside:
                     raise Refused(f"FactorBatch.jobs has {number}, already answered", "duplicate")
                 else:
                     beside[number] = place, job
@@ -624,7 +624,7 @@ class Dispatch(FactorSource):
             future = self._thread.submit(self.decoder.decode_several, message, list(beside.values()))
             for k, (place, job) in enumerate(beside.values()):
                 take, by_slot = partial(_result, future, k), (message.matrix_shared, True)
-                self._decoding[job.number] = Decoding(job, future, take, message.seconds[place], by_slot, duration)
+                self.decoding[job.number] = Decoding(job, future, take, message.seconds[place], by_slot, duration)
 
     def _fetch(self, message: FactorMessage, job: InFlightJob) -> None:
         """Begins to fetch a factor in parts, beside the caller. Its worker is free for the jobs of other objects."""
@@ -641,7 +641,7 @@ class Dispatch(FactorSource):
         decode = partial(self.decoder.decode, message, b"", job, fetch.run)
         future, by_slot = self._fetching.submit(decode), _slots_used(message, fetch)
         made = Decoding(job, future, future.result, message.seconds, by_slot, fetch=fetch)
-        self._decoding[job.number] = made
+        self.decoding[job.number] = made
         self._fetches.add(job.number)
 
     def _give_back(self, slots: Sequence[Slot], clean: bool = True) -> None:
@@ -656,21 +656,21 @@ class Dispatch(FactorSource):
 
     def _is_decoded(self, job: InFlightJob) -> bool:
         """True while the answer to a job is taken in beside the caller."""
-        return job.number in self._decoding
+        return job.number in self.decoding
 
     def _is_arriving(self, job: InFlightJob) -> bool:
         """True while the answer to a job is taken in, unless it comes in parts and none comes any more."""
-        each = self._decoding.get(job.number)
+        each = self.decoding.get(job.number)
         return each is not None and not (each.fetch is not None and each.fetch.stalls)
 
     def _take_decoded(self) -> None:
         """Takes the large factors that were decoded beside the caller, unless their jobs are over."""
         for number in self._fetches:
-            job, fetch = self._decoding[number].job, self._decoding[number].fetch
+            job, fetch = self.decoding[number].job, self.decoding[number].fetch
             if fetch is not None and self.leases.by_object.get(job.object) is not job:
                 fetch.give_up()
-        for number in [number for number, each in self._decoding.items() if each.future.done()]:
-            each = self._decoding.pop(number)
+        for number in [number for number, each in self.decoding.items() if each.future.done()]:
+            each = self.decoding.pop(number)
             self._fetches.discard(number)
             job, fetch = each.job, each.fetch
             if fetch is not None:
@@ -692,7 +692,7 @@ class Dispatch(FactorSource):
         """Frees the worker of a job that is over, if it is still there."""
         if self.leases.by_worker.get(job.worker, {}).get(job.number) is job:
             if self.leases.is_reassigned(job):  # its parts did not come
-                self._reliability.on_failure(job.worker, job.object, self._clock())
+                self.reliability.on_failure(job.worker, job.object, self._clock())
             self.leases.finish(job)
 
     def _take_factor(
@@ -709,14 +709,14 @@ class Dispatch(FactorSource):
         try:
             if failure:
                 self._counters.add("failures")
-                self._reliability.on_failure(job.worker, job.object, now)
+                self.reliability.on_failure(job.worker, job.object, now)
                 return self._fail(job, f"failed: {failure[:500]}")
             self._factors.append(decode())
             seconds = told
             lasted = self._duration(job, now) if duration is None else duration
             self._timing.record(job.worker, job.object, lasted, seconds)
         except Refused as refusal:
-            self._reliability.on_failure(job.worker, job.object, now)
+            self.reliability.on_failure(job.worker, job.object, now)
             self._fail(job, f"was refused: {refusal}")
             raise
         finally:
