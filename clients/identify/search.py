@@ -56,12 +56,12 @@ class Search:
         }
         try:
             storage = JournalStorage(JournalFileBackend(str(path)))
-            self._study = optuna.create_study(study_name=STUDY, storage=storage, load_if_exists=True)
+            self.study = optuna.create_study(study_name=STUDY, storage=storage, load_if_exists=True)
         except (OSError, ValueError, KeyError, json.JSONDecodeError) as error:
             raise BadInput(f"{path}: cannot be used as the file of runs: {error}") from None
-        known = self._study.user_attrs.get("question")
+        known = self.study.user_attrs.get("question")
         if known is None:
-            self._study.set_user_attr("question", question)
+            self.study.set_user_attr("question", question)
         elif known != question:
             raise BadInput(
                 f"{path}: has runs of another scene, other curves or bounds; --journal FILE takes another name"
@@ -90,11 +90,11 @@ class Search:
     @property
     def _number(self) -> int:
         done = self._optuna.trial.TrialState.COMPLETE, self._optuna.trial.TrialState.FAIL
-        return len(self._study.get_trials(deepcopy=False, states=done))
+        return len(self.study.get_trials(deepcopy=False, states=done))
 
     def _tried(self) -> list[Tried]:
         states = (self._optuna.trial.TrialState.COMPLETE,)
-        trials = self._study.get_trials(deepcopy=False, states=states)
+        trials = self.study.get_trials(deepcopy=False, states=states)
         return [
             Tried(
                 np.array([f.share(t.params[f.key]) for f in self.fits]), np.array(t.user_attrs["residual"], dtype=float)
@@ -113,7 +113,7 @@ class Search:
 
     def _make(self, attempt: Attempt, shares: NDArray[np.float64] | None) -> str:
         """Makes a run and keeps it; returns why it failed, or nothing."""
-        study, states = self._study, self._optuna.trial.TrialState
+        study, states = self.study, self._optuna.trial.TrialState
         study.sampler = self._optuna.samplers.TPESampler(seed=self.seed + self._number)
         waits = study.get_trials(deepcopy=False, states=(states.WAITING,))  # of one that was killed before it began
         if shares is not None and not waits:

@@ -120,10 +120,10 @@ class OfferedFactors:
         question = parse(FactorPart, query.payload, CHANNELS["part"].limit)
         check_header(question)
         with self._lock:
-            answer, payload = self._part(question)
+            answer, payload = self.part(question)
         query.reply(self._key, payload, attachment=answer.SerializeToString())
 
-    def _part(self, question: FactorPart) -> tuple[FactorPart, bytes]:
+    def part(self, question: FactorPart) -> tuple[FactorPart, bytes]:
         """Returns the answer to a question, and the part unless it was written into a slot."""
         wanted = question.header.incarnation, question.job
         found = next((name for name, each in self._offered.items() if (each.incarnation, each.job) == wanted), None)

@@ -246,7 +246,7 @@ class Engine(Protocol):
         ...
 
     def post_factors(self, bodies: Sequence[int], factors: Sequence[Factor]) -> None:
-        """Posts factors of different bodies, one of each."""
+        """Posts factors of different bodies, one of each. Their values do not change any more."""
 
     def prepare_for_factors(self) -> None:
         """Begins what the first factor would wait for, without waiting."""

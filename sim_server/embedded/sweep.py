@@ -96,7 +96,7 @@ def sweep(
     if not np.isfinite(seconds) or seconds < 0 or (seconds == 0 and measure is None):
         raise InputError(f"sweep: seconds = {seconds}: must be above 0, or 0 with a function that makes the steps")
     jobs = [(_checked(scene, values), seconds, measure, device, workers) for values in points]
-    found = _found(jobs, executor, (1 if device == "gpu" else _half()) if processes is None else processes)
+    found = run_all(jobs, executor, (1 if device == "gpu" else _half()) if processes is None else processes)
     return Table([{**values, **row} for values, row in zip(points, found, strict=True)])
 
 
@@ -147,7 +147,7 @@ def _checked(scene: Scene, values: Mapping[str, Any]) -> Scene:
         raise InputError(f"sweep: {', '.join(f'{k} = {v}' for k, v in values.items())}: {error}") from None
 
 
-def _found(jobs: list[tuple[Any, ...]], executor: Any, processes: int) -> Iterator[dict[str, Any]]:
+def run_all(jobs: list[tuple[Any, ...]], executor: Any, processes: int) -> Iterator[dict[str, Any]]:
     """Yields the rows of jobs in their order."""
     if processes < 1:
         raise InputError(f"sweep: processes = {processes}: must be 1 or more")

@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import zenoh
@@ -39,6 +39,8 @@ TOKEN_QUERY_INTERVAL = 1.0  # s between queries for tokens of workers that send 
 FAST_SEND = 0.05  # s in which a fast link takes a job as bytes; zenoh drops what is not taken within 0.25 s
 MAX_NEW_PATTERNS = 256  # that wait to be prepared for; older ones are prepared for when their factors come
 SMALL_BLOCKS = 20_000  # of the largest matrix, if several jobs may wait at a worker
+BEHIND = 10.0  # s of a lease, at most, for what waits at a worker behind a first job, which has a longer one
+MOST_ALONE = 32  # jobs in flight at a worker while they go alone, each with slots of its own, which are slow to make
 QUEUE_SECONDS = 0.02  # s of factorizations that wait at a worker at most
 LOOK_PERIOD = 1e-3  # s between looks at which leases are over
 MAX_SENT = 4096  # times of jobs that are remembered
@@ -48,12 +50,20 @@ FETCHES = 2  # factors that arrive in parts at a time, each in memory of its own
 SLOT_MARGIN = 8  # the slot for an incomplete factor is larger than the largest factor so far by a SLOT_MARGIN-th
 
 
-class AnsweredJob(NamedTuple):
-    """A job whose factor is taken in beside the caller. fetch: of its parts, if it comes in parts."""
+class Decoding(NamedTuple):
+    """A factor that is taken in beside the caller.
 
-    message: FactorMessage
+    future: that is over once it is done, and `take` returns the factor, or raises Refused
+    seconds, by_slot, duration: as of Dispatch._take_factor
+    fetch: of its parts, if it comes in parts
+    """
+
     job: InFlightJob
-    factor: Future[Factor]
+    future: Future[Any]
+    take: Callable[[], Factor]
+    seconds: float
+    by_slot: tuple[bool, bool]
+    duration: float | None = None
     fetch: FactorFetch | None = None
 
 
@@ -83,7 +93,7 @@ class Dispatch(FactorSource):
         self._registry = WorkerRegistry(incarnation, silence)
         self.leases = Leases(pool)
         self._timing = WorkerTiming()
-        self._reliability = WorkerReliability()
+        self.reliability = WorkerReliability()
         self._lock = threading.RLock()  # a status lists the workers while the loop thread takes in a factor
         self._last_worker: dict[str, str] = {}  # by object: the worker that knows its pattern already
         self._free_since: dict[str, float] = {}  # by worker, time of its last answer
@@ -92,7 +102,8 @@ class Dispatch(FactorSource):
         self._fast_links: set[str] = set()  # workers without shared memory whose link takes a job at once
         self._thread = ThreadPoolExecutor(1, "large factors")
         self._fetching = ThreadPoolExecutor(FETCHES, "parts of factors")
-        self._decoding: list[AnsweredJob] = []
+        self.decoding: dict[int, Decoding] = {}  # by number of the job
+        self._fetches: set[int] = set()  # of these, the jobs whose factors come in parts
         self._factors: list[Factor] = []
         self._failures: list[tuple[str, str]] = []
         self._patterns: list[tuple[str, FactorPattern]] = []
@@ -115,7 +126,7 @@ class Dispatch(FactorSource):
             self.decoder.announce(topology)
             self.leases.forget_object(topology.header.object)
             self._timing.forget_object(topology.header.object)
-            self._reliability.forget_object(topology.header.object)
+            self.reliability.forget_object(topology.header.object)
 
     def epoch(self, name: str) -> int | None:
         """Returns the epoch of an object that was announced last; jobs of others are refused."""
@@ -191,7 +202,7 @@ class Dispatch(FactorSource):
     def reserved(self) -> set[str]:
         """Objects that are better left for a busy worker, since factors by the idle ones failed."""
         with self._lock:
-            failing = self._reliability.failing_objects
+            failing = self.reliability.failing_objects
             if not failing:
                 return set()
             idle, available = self._open(), self._available()
@@ -200,19 +211,19 @@ class Dispatch(FactorSource):
     def consecutive_failures(self) -> dict[str, int]:
         """Jobs in a row that failed at the best worker of each object."""
         with self._lock:
-            failing = self._reliability.failing_objects
+            failing = self.reliability.failing_objects
             available = self._available() if failing else []
-            return {object: self._reliability.consecutive_failures(available, object) for object in failing}
+            return {object: self.reliability.consecutive_failures(available, object) for object in failing}
 
     def factor_failed(self, worker: str, object: str) -> None:
         """Notes that a factor made by `worker` was rejected, or that solves had to abandon it."""
         with self._lock:
-            self._reliability.on_failure(worker, object, self._clock())
+            self.reliability.on_failure(worker, object, self._clock())
 
     def factor_helped(self, worker: str, object: str) -> None:
         """Notes that a solve converged with a factor made by `worker`."""
         with self._lock:
-            self._reliability.on_success(worker, object)
+            self.reliability.on_success(worker, object)
 
     # ---- jobs to workers -------------------------------------------------------------------------------------
 
@@ -235,10 +246,11 @@ class Dispatch(FactorSource):
         taken = [False] * len(jobs)
         batches: dict[tuple[str, tuple[str, Method]], list[int]] = {}  # places of jobs by worker and what they share
         rooms = {name: self._room(name) for name in self._open()} if len(jobs) > 1 else {}
+        able = {name for name in rooms if self._takes_batches(name)}
         for place, job in enumerate(jobs):
             idle = [name for name, room in rooms.items() if room > 0]
             worker = self._worker_for(job, idle, rooms) if idle else None
-            if worker is None or not self._may_batch(job, worker):
+            if worker is None or worker not in able or not self._fits_batch(job):
                 taken[place] = self._submit(job)
                 rooms = {name: self._room(name) for name in self._open()}
                 for (name, _), places in batches.items():
@@ -259,23 +271,20 @@ class Dispatch(FactorSource):
         if job.object in self.leases.by_object:
             return None
         able = [name for name in idle if not job.positions or self._assembles(name)]
-        if self._reliability.failing_objects:
+        if self.reliability.failing_objects:
             able = self._candidates(able, self._available(), job.object)
         return self._choose(able, job.object, rooms) if able else None
 
-    def _may_batch(self, job: Job, worker: str) -> bool:
-        """True if a job of the worker may share a message with others: its object is small, and the size of its factor
-        is known."""
+    def _fits_batch(self, job: Job) -> bool:
+        """True if the size of the factor is known: that of an incomplete one may grow."""
+        known = self.decoder.objects[job.object].largest
+        return not job.positions and job.method.name in known and job.method.name != "incomplete_cholesky"
+
+    def _takes_batches(self, worker: str) -> bool:
+        """True if several jobs of a worker may share a message. It has room for several only where all objects are
+        small."""
         info = self._registry.info(worker)
-        return (
-            not job.positions
-            and job.method.name in self.decoder.objects[job.object].largest
-            and job.method.name != "incomplete_cholesky"  # the next factor may be larger
-            and info is not None
-            and info.batches
-            and self._room(worker) > 1
-            and self._has_slots(worker)
-        )
+        return info is not None and info.batches and self._room(worker) > 1 and self._has_slots(worker)
 
     def _send_batch(self, worker: str, jobs: Sequence[Job]) -> list[bool]:
         """Sends jobs to a worker in one message, or one by one if there are no slots for them together."""
@@ -315,7 +324,7 @@ class Dispatch(FactorSource):
     def _on_sent(self, worker: str, jobs: Sequence[Job]) -> None:
         for job in jobs:
             self._last_worker[job.object] = worker
-        self._reliability.on_sent(worker, self._clock())
+        self.reliability.on_sent(worker, self._clock())
         self._counters.add("jobs", len(jobs))
         self._counters.add("bytes_out", sum(job.values.nbytes for job in jobs))
 
@@ -364,7 +373,7 @@ class Dispatch(FactorSource):
             job.warp,
             np.dtype(job.dtype).name,
             worker,
-            deadline=now + lease,
+            deadline=now + max(lease, min(self.leases.deadlines().get(worker, 0.0) - now, BEHIND)),
             factor_slot=factor_slot,
             factor_generation=factor_slot.generation if factor_slot else 0,
             slots=slots,
@@ -385,7 +394,7 @@ class Dispatch(FactorSource):
         """Available workers with room for a job."""
         available, now = self._available(), self._clock()
         free = [name for name in available if self._room(name) > 0]
-        return [name for name in free if self._reliability.may_get_job(name, available, now)]
+        return [name for name in free if self.reliability.may_get_job(name, available, now)]
 
     def _room(self, worker: str) -> int:
         """Number of jobs that a worker can take beside those it has.
@@ -397,18 +406,19 @@ class Dispatch(FactorSource):
         most = 1
         small = self.decoder.most_blocks <= SMALL_BLOCKS and self._pool is not None
         if info is not None and info.shared_memory and seconds is not None and small:
-            most = max(1, min(info.most_jobs, MOST_JOBS, int(QUEUE_SECONDS / max(seconds, 1e-6))))
+            most = MOST_JOBS if info.batches and self.decoder.most_are_sized else MOST_ALONE
+            most = max(1, min(info.most_jobs, most, int(QUEUE_SECONDS / max(seconds, 1e-6))))
         return max(0, most - self._waiting(worker))
 
     def _waiting(self, worker: str) -> int:
         """Number of jobs that a worker has not done yet; those whose parts are fetched are done."""
-        fetched = sum(each.job.worker == worker for each in self._decoding if each.fetch is not None)
+        fetched = sum(self.decoding[number].job.worker == worker for number in self._fetches)
         return self.leases.count(worker) - fetched
 
     def _candidates(self, idle: list[str], available: list[str], object: str) -> list[str]:
         """Idle workers that are not suspended for the object; all idle ones if all available workers are."""
         now = self._clock()
-        good = [name for name in available if not self._reliability.is_suspended(name, object, now)]
+        good = [name for name in available if not self.reliability.is_suspended(name, object, now)]
         return [name for name in idle if name in good] if good else idle
 
     def _has_candidates(self, job: InFlightJob) -> bool:
@@ -516,11 +526,11 @@ class Dispatch(FactorSource):
             self._on_expired(job, f"was lost: worker {job.worker} says that it has no job")
 
     def _sent_at(self, job: InFlightJob) -> float:
-        return float("inf") if self._is_decoded(job) else self._sent.get(job.number, float("inf"))
+        return float("inf") if job.number in self.decoding else self._sent.get(job.number, float("inf"))
 
     def _on_expired(self, job: InFlightJob, why: str) -> None:
         self._fast_links.discard(job.worker)  # zenoh may have dropped the job
-        self._reliability.on_failure(job.worker, job.object, self._clock())
+        self.reliability.on_failure(job.worker, job.object, self._clock())
         self._fail(job, why)
 
     def _query_tokens(self) -> None:
@@ -551,7 +561,7 @@ class Dispatch(FactorSource):
     def _remove_worker(self, name: str) -> None:
         lost = self.leases.remove_worker(name)
         self._timing.forget_worker(name)
-        self._reliability.forget_worker(name)
+        self.reliability.forget_worker(name)
         self._fast_links.discard(name)
         self._free_since.pop(name, None)
         self._answered_at.pop(name, None)
@@ -569,7 +579,7 @@ class Dispatch(FactorSource):
         now = self._clock()
         self._registry.mark_seen(job.worker, now)
         self._free_since[job.worker] = now
-        self._reliability.on_answer(job.worker)
+        self.reliability.on_answer(job.worker)
         if self.leases.is_reassigned(job):
             return self.leases.finish(job, None if message.failure else message.seconds)
         if message.parts and not message.failure:
@@ -577,7 +587,9 @@ class Dispatch(FactorSource):
         decode = partial(self.decoder.decode, message, sample.payload, job)
         if not message.failure and 4 * message.nonzeros > LARGE:  # its bytes are copied and checked beside the caller
             self._refuse_second(job)
-            self._decoding.append(AnsweredJob(message, job, self._thread.submit(decode)))
+            future = self._thread.submit(decode)
+            made = Decoding(job, future, future.result, message.seconds, _slots_used(message))
+            self.decoding[job.number] = made
             return
         self._take_factor(job, decode, message.failure, message.seconds, _slots_used(message))
 
@@ -586,23 +598,33 @@ class Dispatch(FactorSource):
         message = self.decoder.parse_batch(sample.key_expr, sample.attachment)
         now, worker = self._clock(), message.worker
         self._registry.mark_seen(worker, now)
-        duration: float | None = None
+        duration, large = 0.0, 4 * sum(message.nonzeros) > LARGE
+        beside: dict[int, tuple[int, InFlightJob]] = {}  # by number; large all together: decoded beside the caller
         for place, number in enumerate(message.jobs):
             try:
                 job = self.leases.match_answer(number, worker, None)
-                failure = message.failures[place] if message.failures else ""
-                if duration is None:
+                if not duration:
                     duration = self._duration(job, now) / len(message.jobs)
                     self._free_since[worker] = now
-                    self._reliability.on_answer(worker)
+                    self.reliability.on_answer(worker)
                 if self.leases.is_reassigned(job):
-                    self.leases.finish(job, None if failure else message.seconds[place])
-                    continue
-                decode = partial(self.decoder.decode_one, message, place, job)
-                by_slot = message.matrix_shared, True
-                self._take_factor(job, decode, failure, message.seconds[place], by_slot, duration)
+                    self.leases.finish(job)
+                elif failure := message.failures[place] if message.failures else "":
+                    self._take_factor(job, _no_factor, failure, 0.0, (True, True))
+                elif not large:
+                    decode, told = partial(self.decoder.decode_one, message, place, job), message.seconds[place]
+                    self._take_factor(job, decode, "", told, (message.matrix_shared, True), duration)
+                elif number in self.decoding or number in beside:
+                    raise Refused(f"FactorBatch.jobs has {number}, already answered", "duplicate")
+                else:
+                    beside[number] = place, job
             except Refused as refusal:
                 self._counters.refuse(refusal)
+        if beside:
+            future = self._thread.submit(self.decoder.decode_several, message, list(beside.values()))
+            for k, (place, job) in enumerate(beside.values()):
+                take, by_slot = partial(_result, future, k), (message.matrix_shared, True)
+                self.decoding[job.number] = Decoding(job, future, take, message.seconds[place], by_slot, duration)
 
     def _fetch(self, message: FactorMessage, job: InFlightJob) -> None:
         """Begins to fetch a factor in parts, beside the caller. Its worker is free for the jobs of other objects."""
@@ -617,7 +639,10 @@ class Dispatch(FactorSource):
             self._session, self._server, self._incarnation, self._counters, job, message.nonzeros, message.parts, slots
         )
         decode = partial(self.decoder.decode, message, b"", job, fetch.run)
-        self._decoding.append(AnsweredJob(message, job, self._fetching.submit(decode), fetch))
+        future, by_slot = self._fetching.submit(decode), _slots_used(message, fetch)
+        made = Decoding(job, future, future.result, message.seconds, by_slot, fetch=fetch)
+        self.decoding[job.number] = made
+        self._fetches.add(job.number)
 
     def _give_back(self, slots: Sequence[Slot], clean: bool = True) -> None:
         """Frees the slots of a fetch. clean: nobody writes to them any more."""
@@ -631,24 +656,23 @@ class Dispatch(FactorSource):
 
     def _is_decoded(self, job: InFlightJob) -> bool:
         """True while the answer to a job is taken in beside the caller."""
-        return any(each.job.number == job.number for each in self._decoding)
+        return job.number in self.decoding
 
     def _is_arriving(self, job: InFlightJob) -> bool:
         """True while the answer to a job is taken in, unless it comes in parts and none comes any more."""
-        return any(
-            each.job.number == job.number and not (each.fetch is not None and each.fetch.stalls)
-            for each in self._decoding
-        )
+        each = self.decoding.get(job.number)
+        return each is not None and not (each.fetch is not None and each.fetch.stalls)
 
     def _take_decoded(self) -> None:
         """Takes the large factors that were decoded beside the caller, unless their jobs are over."""
-        for each in self._decoding:
-            if each.fetch is not None and self.leases.by_object.get(each.job.object) is not each.job:
-                each.fetch.give_up()
-        done = [each for each in self._decoding if each.factor.done()]
-        for each in done:
-            self._decoding.remove(each)
-            message, job, factor, fetch = each
+        for number in self._fetches:
+            job, fetch = self.decoding[number].job, self.decoding[number].fetch
+            if fetch is not None and self.leases.by_object.get(job.object) is not job:
+                fetch.give_up()
+        for number in [number for number, each in self.decoding.items() if each.future.done()]:
+            each = self.decoding.pop(number)
+            self._fetches.discard(number)
+            job, fetch = each.job, each.fetch
             if fetch is not None:
                 self._give_back(fetch.slots, fetch.clean)
                 if fetch.gone.is_set():  # why its job is over was told
@@ -657,10 +681,10 @@ class Dispatch(FactorSource):
             try:
                 current = self.leases.match_answer(job.number, job.worker, job.epoch)
                 if self.leases.is_reassigned(current):
-                    self.leases.finish(current, message.seconds)
+                    self.leases.finish(current)
                 else:
-                    told = message.failure, message.seconds, _slots_used(message, fetch)
-                    self._take_factor(current, factor.result, *told)
+                    by_slot = each.by_slot if fetch is None else (each.by_slot[0], bool(fetch.slots))
+                    self._take_factor(current, each.take, "", each.seconds, by_slot, each.duration)
             except Refused as refusal:
                 self._counters.refuse(refusal)
 
@@ -668,7 +692,7 @@ class Dispatch(FactorSource):
         """Frees the worker of a job that is over, if it is still there."""
         if self.leases.by_worker.get(job.worker, {}).get(job.number) is job:
             if self.leases.is_reassigned(job):  # its parts did not come
-                self._reliability.on_failure(job.worker, job.object, self._clock())
+                self.reliability.on_failure(job.worker, job.object, self._clock())
             self.leases.finish(job)
 
     def _take_factor(
@@ -685,14 +709,14 @@ class Dispatch(FactorSource):
         try:
             if failure:
                 self._counters.add("failures")
-                self._reliability.on_failure(job.worker, job.object, now)
+                self.reliability.on_failure(job.worker, job.object, now)
                 return self._fail(job, f"failed: {failure[:500]}")
             self._factors.append(decode())
             seconds = told
             lasted = self._duration(job, now) if duration is None else duration
             self._timing.record(job.worker, job.object, lasted, seconds)
         except Refused as refusal:
-            self._reliability.on_failure(job.worker, job.object, now)
+            self.reliability.on_failure(job.worker, job.object, now)
             self._fail(job, f"was refused: {refusal}")
             raise
         finally:
@@ -718,6 +742,19 @@ class Dispatch(FactorSource):
 
     def _fail(self, job: InFlightJob, why: str) -> None:
         self._failures.append((job.object, f"factorization of {job.object} at step {job.step} {why}"))
+
+
+def _no_factor() -> Factor:
+    """Raises Refused: the worker has told why there is none."""
+    raise Refused("there is no factor", "malformed")
+
+
+def _result(future: Future[list[Factor | Refused]], place: int) -> Factor:
+    """Returns one of several factors that were decoded together; raises Refused."""
+    found = future.result()[place]
+    if isinstance(found, Refused):
+        raise found
+    return found
 
 
 def _slots_used(message: FactorMessage, fetch: FactorFetch | None = None) -> tuple[bool, bool]:

@@ -2,7 +2,7 @@
 """Checks and decodes what workers send: patterns of L, and factors as bytes or in a slot of shared memory."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -45,16 +45,23 @@ class FactorDecoder:
         self._incarnation = incarnation
         self.objects: dict[str, AnnouncedObject] = {}
         self._most_blocks = 0
+        self._unsized: set[str] = set()  # objects that have had no factor in this epoch
 
     @property
     def most_blocks(self) -> int:
         """Blocks of the largest matrix."""
         return self._most_blocks
 
+    @property
+    def most_are_sized(self) -> bool:
+        """True if nearly all objects have had a factor, so that the size of the next one is known."""
+        return 10 * len(self._unsized) <= len(self.objects)
+
     def announce(self, topology: Topology) -> None:
         """Begins a new epoch of an object; patterns of the last one are dropped."""
         header = topology.header
         self.objects[header.object] = AnnouncedObject(header.epoch, 3 * topology.nodes, len(topology.columns) // 4)
+        self._unsized.add(header.object)
         self._most_blocks = max(known.blocks for known in self.objects.values())
 
     def add_pattern(self, key: object, data: Sized) -> tuple[str, FactorPattern] | None:
@@ -142,6 +149,18 @@ class FactorDecoder:
         remedy = message.remedies[place] if message.remedies else ""
         return self._factor(pattern, values, message.checksums[place], job, seconds, remedy)
 
+    def decode_several(
+        self, message: FactorBatch, answers: Sequence[tuple[int, InFlightJob]]
+    ) -> list[Factor | Refused]:  # fmt: skip
+        """Returns the factors at some places of a message, or why one is refused. From any thread."""
+        made: list[Factor | Refused] = []
+        for place, job in answers:
+            try:
+                made.append(self.decode_one(message, place, job))
+            except Refused as refusal:
+                made.append(refusal)
+        return made
+
     def _factor(
         self, pattern: FactorPattern, values: Float32 | Float64, checksum: int | None, job: InFlightJob,
         seconds: float, remedy: str,
@@ -149,6 +168,7 @@ class FactorDecoder:
         check_values(values, pattern, checksum)
         largest = self.objects[job.object].largest
         largest[job.method] = max(largest.get(job.method, 0), pattern.nonzeros)
+        self._unsized.discard(job.object)
         return Factor(job.object, job.epoch, job.step, job.warp, pattern, values, job.worker, seconds, remedy[:200])
 
     def _object(self, message: PatternMessage | FactorMessage, key: object, channel: str) -> AnnouncedObject:

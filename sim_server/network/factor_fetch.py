@@ -45,9 +45,9 @@ class FactorFetch:
         self, session: zenoh.Session, server: str, incarnation: int, counters: Counters, job: InFlightJob,
         nonzeros: int, parts: Sequence[int], slots: Sequence[Slot],
     ):  # fmt: skip
-        self._session, self._incarnation, self._counters, self._job = session, incarnation, counters, job
+        self._session, self._incarnation, self._counters, self.job = session, incarnation, counters, job
         self._key = key("part", server, worker=job.worker)
-        self._nonzeros, self._parts = nonzeros, list(parts)
+        self._nonzeros, self.parts = nonzeros, list(parts)
         self.slots = slots
         self.gone = threading.Event()
         self.clean = False  # all questions were answered: the worker writes to no slot any more
@@ -70,8 +70,8 @@ class FactorFetch:
         """Returns the values; raises Refused."""
         if self.gone.is_set():  # while it waited for its turn
             raise Refused("a factor is not waited for any more", "late")
-        arriving = ArrivingFactor(self._nonzeros, self._job.dtype, self._job.part_bytes, self._parts)
-        count = len(self._parts)
+        arriving = ArrivingFactor(self._nonzeros, self.job.dtype, self.job.part_bytes, self.parts)
+        count = len(self.parts)
         end = time.monotonic() + ATTEMPTS * QUESTION_TIME + arriving.values.nbytes / MIN_BANDWIDTH
         asked = {number: self._ask(number) for number in range(min(AHEAD, count))}
         for number in range(count):
@@ -92,21 +92,21 @@ class FactorFetch:
             for reply in answers:
                 if self.gone.is_set():
                     break
-                if reply.ok is not None and self._took(number, reply.ok, arriving):
+                if reply.ok is not None and self.took(number, reply.ok, arriving):
                     return
             if self.gone.wait(PAUSE):
                 raise Refused("a factor is not waited for any more", "late")
-        count = len(self._parts)
-        raise Refused(f"part {number} of {count} of a factor did not come from worker {self._job.worker}", "late")
+        count = len(self.parts)
+        raise Refused(f"part {number} of {count} of a factor did not come from worker {self.job.worker}", "late")
 
-    def _took(self, number: int, sample: zenoh.Sample, arriving: ArrivingFactor) -> bool:
+    def took(self, number: int, sample: zenoh.Sample, arriving: ArrivingFactor) -> bool:
         """Takes the answer to a question, if it is one: anybody may answer."""
         try:
             answer = parse(FactorPart, sample.attachment, CHANNELS["part"].limit)
             check_header(answer, incarnation=self._incarnation)
-            if (answer.job, answer.number) != (self._job.number, number):
+            if (answer.job, answer.number) != (self.job.number, number):
                 raise Refused(
-                    f"FactorPart is {answer.number} of job {answer.job}; allowed: {number} of {self._job.number}",
+                    f"FactorPart is {answer.number} of job {answer.job}; allowed: {number} of {self.job.number}",
                     "sequence",
                 )
             size = arriving.bytes_of_part(number)
@@ -125,7 +125,7 @@ class FactorFetch:
 
     def _ask(self, number: int) -> zenoh.handlers.Handler[zenoh.Reply]:
         header = Header(protocol=PROTOCOL, incarnation=self._incarnation)
-        question = FactorPart(header=header, job=self._job.number, number=number)
+        question = FactorPart(header=header, job=self.job.number, number=number)
         if self.slots:
             question.slot.CopyFrom(self._slot(number).message())
         try:

@@ -81,7 +81,7 @@ class Telemetry:
         self.started = time.monotonic()
         self.record_every = self.simulation.scene.record.every if recorder else 0
         self._unsent = UnsentSteps(MAX_BATCH)
-        self._thinning = LogThinning(len(self.simulation.world.bodies))
+        self.thinning = LogThinning(len(self.simulation.world.bodies))
         self._told_losses: set[str] = set()
         bodies = len(self.simulation.world.bodies)
         self._window = np.zeros((bodies, STATISTICS_STEPS), np.int32)  # iterations of the last steps
@@ -198,8 +198,8 @@ class Telemetry:
         if self.patient:
             return self._encoded(records, reactions, readings)
         behind = recorder.behind or len(records) > BEHIND * self.engine.loop.record_capacity
-        chosen, left_out = self._thinning.choose(records, behind)
-        recorder.thinned = self._thinning.count
+        chosen, left_out = self.thinning.choose(records, behind)
+        recorder.thinned = self.thinning.count
         told = None if readings is None else readings[chosen]
         return self._encoded(as_bytes(records)[chosen].view(records.dtype), reactions[chosen], told, left_out)
 
@@ -372,7 +372,7 @@ class Telemetry:
         dropped = loop.frames_dropped + (self.recorder.dropped if self.recorder else 0)
         status.frames_dropped, status.records_dropped = dropped, loop.records_dropped + loop.others_dropped
         status.records_lost = self.recorder.lost if self.recorder else 0
-        status.records_thinned = self._thinning.count
+        status.records_thinned = self.thinning.count
         status.recording_failure = self.recorder.failure[:400] if self.recorder else ""
         bound = self.driver.age_bound()
         latest = self._latest(bound)
@@ -488,7 +488,7 @@ class Telemetry:
     def losses(self) -> list[str]:
         """Returns a line when records are missing for the first time, of each kind."""
         found, losses = [], (
-            (self._thinning.count, "the log cannot follow: of steps in which nothing changes it has, until it can, the "
+            (self.thinning.count, "the log cannot follow: of steps in which nothing changes it has, until it can, the "
              f"records of every {KEPT_EVERY}th alone; a replay repeats all of them"),
             (self.engine.loop.records_dropped, "records of whole steps were not read in time and are lost" + (
                 ", for the log, too: a replay ends before them" if self.recorder else "")),

@@ -62,10 +62,11 @@ class SnapshotPool:
         """True if the copy is all that a worker needs. Positions do not tell of the springs of a grab, nor of other
         parameters than those of the start, which may have come between the request and the copy."""
         assert state.job.copy is not None
-        step = self.step(state)
-        simulation = self._simulation
+        if state.job.copy.ndim == 3:
+            return True
+        step, simulation = self.step(state), self._simulation
         known = all(e.known_to_workers_at(step) for e in simulation.effects.values())
-        return state.job.copy.ndim == 3 or (known and simulation.parameters.known_to_workers_at(step))
+        return known and simulation.parameters.known_to_workers_at(step)
 
     def discard(self, state: BodyUpdateState) -> None:
         """Gives up a copy that is not sent."""

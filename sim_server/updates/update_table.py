@@ -57,7 +57,7 @@ class Cell:
         self._column = self._column or name
 
     def __get__(self, row: Any, owner: type | None = None) -> Any:
-        return getattr(row._table, self._column)[row._index].item()
+        return getattr(row._table, self._column).item(row._index)
 
     def __set__(self, row: Any, value: Any) -> None:
         getattr(row._table, self._column)[row._index] = value

@@ -10,6 +10,7 @@ import weakref
 import numpy as np
 import pytest
 
+from protocol.factor import Factor
 from sim_server.backends.cpu.device import module
 from sim_server.backends.cpu.engine import CpuEngine
 from sim_server.backends.cpu.structs import RECORD
@@ -134,14 +135,25 @@ def test_a_factor_is_taken_up_between_steps_and_the_last_one_wins():
     assert sim.engine.factor_bytes(0) == values.nbytes + pattern.rows.nbytes
 
 
-def test_a_factor_in_use_is_never_overwritten():
-    """Two buffers do: one in use, one waiting or being filled."""
+def one(engine: CpuEngine, factor: Factor) -> None:
+    engine.post_factor(0, factor.pattern, factor.values, factor.step)
+
+
+def several(engine: CpuEngine, factor: Factor) -> None:
+    engine.post_factors([0], [factor])
+
+
+@pytest.mark.parametrize("ways", [(one,), (several,), (one, several), (several, several, one, one)])
+def test_a_factor_in_use_is_never_overwritten(ways):
+    """Two buffers do: one in use, one waiting or being filled. Values that were given over stay as they are."""
     sim = falling()
     sim.engine.assemble()
     pattern, values = factor_of(sim)
     sim.engine.solve()
+    given: list[Factor] = []
     for step in range(20):
-        sim.engine.post_factor(0, pattern, values * (1 + step), step)
+        given.append(Factor("bar", 1, step, True, pattern, values * (1 + step), "w", 0.0))
+        ways[step % len(ways)](sim.engine, given[-1])
         if step % 3 == 0:
             sim.engine.run(1)
         assert sim.engine.factor_step(0) == step - step % 3
@@ -149,6 +161,7 @@ def test_a_factor_in_use_is_never_overwritten():
         assert len(in_use) == 1
         assert np.array_equal(in_use[0].values, values * (1 + step - step % 3))
     assert len(sim.engine.factor_buffers(0)) == 2
+    assert all(np.array_equal(factor.values, values * (1 + factor.step)) for factor in given)
 
 
 def test_a_factor_just_taken_out_of_the_mailbox_is_not_overwritten():

@@ -134,5 +134,5 @@ def test_as_many_runs_as_control_groups_allow(monkeypatch):
     """In a container of 4 processors on a machine of 64."""
     monkeypatch.setattr(processors.os, "sched_getaffinity", lambda _: set(range(64)))
     monkeypatch.setattr(processors, "quota", lambda: 3.5)
-    monkeypatch.setattr(sweep, "_found", lambda jobs, executor, count: [{"count": count}])
+    monkeypatch.setattr(sweep, "run_all", lambda jobs, executor, count: [{"count": count}])
     assert wf.sweep(SCENE, {"dt": [0.01]}, 0.02)["count"].tolist() == [2]

@@ -80,7 +80,7 @@ def test_a_search_that_was_killed_before_a_run_began_goes_on_with_it(tmp_path: P
     def ask(*_: object) -> None:
         raise KeyboardInterrupt
 
-    killed._study.ask = ask  # type: ignore[method-assign,assignment]
+    killed.study.ask = ask  # type: ignore[method-assign,assignment]
     with pytest.raises(KeyboardInterrupt):
         killed.run(noted("parts"), 8)
     Search(tmp_path / "parts", known, 0, "q").run(noted("parts"), 8)

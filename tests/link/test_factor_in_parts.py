@@ -214,7 +214,7 @@ def offered(clock: Clock) -> OfferedFactors:
 
 def ask(offered: OfferedFactors, number: int, job: int = JOB, incarnation: int = INCARNATION) -> tuple[Any, bytes]:
     header = Header(protocol=PROTOCOL, incarnation=incarnation)
-    return offered._part(FactorPart(header=header, job=job, number=number))
+    return offered.part(FactorPart(header=header, job=job, number=number))
 
 
 def test_a_worker_answers_with_the_parts_that_it_announced(offered: OfferedFactors) -> None:

@@ -279,7 +279,7 @@ def counted_fetches(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     run_fetch = FactorFetch.run
 
     def noted(fetch: FactorFetch) -> object:
-        found.append(len(fetch._parts))
+        found.append(len(fetch.parts))
         return run_fetch(fetch)
 
     monkeypatch.setattr(FactorFetch, "run", noted)

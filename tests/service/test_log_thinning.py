@@ -155,7 +155,7 @@ def served(path: Path, monkeypatch: pytest.MonkeyPatch, patient: bool) -> tuple[
 
 def test_in_real_time_a_log_that_is_behind_is_thinned_which_is_told_and_counted(tmp_path, monkeypatch):
     telemetry, lines = served(tmp_path / "run.mcap", monkeypatch, patient=False)
-    missing = telemetry._thinning.count
+    missing = telemetry.thinning.count
     assert 50 < missing < 100 and len(lines) == 1 and "the log cannot follow" in lines[0]
     with Recording(tmp_path / "run.mcap") as recording:
         assert any(f"records thinned: {missing}" in note for note in recording.notes)
@@ -166,7 +166,7 @@ def test_in_real_time_a_log_that_is_behind_is_thinned_which_is_told_and_counted(
 
 def test_a_run_without_a_clock_waits_for_its_log_instead(tmp_path, monkeypatch):
     telemetry, lines = served(tmp_path / "run.mcap", monkeypatch, patient=True)
-    assert not lines and telemetry._thinning.count == 0
+    assert not lines and telemetry.thinning.count == 0
     with Recording(tmp_path / "run.mcap") as recording:
         assert recording.steps == 50 and not recording.objects["b"].filled.any()
 

@@ -286,6 +286,44 @@ def test_answers_of_no_job_and_second_answers_are_refused_one_by_one(stage: Hand
     stage.driver.until(lambda: stage.made() == set(NAMES), "the last one")
 
 
+def test_large_batches_are_decoded_beside_the_caller(stage: Hand, monkeypatch: pytest.MonkeyPatch) -> None:
+    """All count as large here. Meanwhile nothing is taken and second answers are refused; then each counts alone."""
+    monkeypatch.setattr(dispatch, "LARGE", 0)
+    batch, go = stage.batch(), threading.Event()
+    decode, before = stage.driver.link.dispatch.decoder.decode_one, stage.driver.link.counters.refusals["duplicate"]
+
+    def slow(*arguments: Any) -> Any:
+        assert go.wait(30)
+        return decode(*arguments)
+
+    monkeypatch.setattr(stage.driver.link.dispatch.decoder, "decode_one", slow)
+    message = stage.answer(batch, [0, 1, 1, 2, 3])
+    message.checksums[3] = 7
+    stage.send(message)
+    stage.send(stage.answer(batch, [0]))
+    stage.driver.until(lambda: stage.driver.link.counters.refusals["duplicate"] == before + 2, "the second answers")
+    assert not stage.driver.factors and stage.driver.link.slots_lent == 2
+    go.set()
+    stage.driver.until(lambda: all_are_back(stage), "the factors")
+    stage.check_factors()
+    assert stage.made() == {"a", "b", "d"} and stage.failed() == {"c"} and stage.driver.link.slots_lent == 0
+
+
+def test_what_waits_behind_a_first_job_has_longer(stage: Hand) -> None:
+    """A worker that has not had an object yet may have to compile and analyse for it."""
+    new = chain(5, "new")
+    stage.driver.link.announce(new)
+    stage.driver.submit(new, 1)
+    batch = stage.batch()
+    leases = {job.object: job.deadline - job.sent_at for job in stage.driver.link.dispatch.leases.jobs}
+    assert {name: round(leases[name]) for name in NAMES} == dict.fromkeys(NAMES, round(dispatch.BEHIND))
+    assert leases["new"] > 2 * dispatch.BEHIND, "but not as long: a message may be lost"
+    answer, values = stage.hand.right_answer(stage.hand.receive(), new)
+    stage.hand.answer(answer, values)
+    stage.send(stage.answer(batch))
+    stage.driver.until(lambda: stage.made() == {"new", *NAMES}, "all factors")
+
+
 def test_a_slot_of_another_generation_is_not_read(stage: Hand) -> None:
     batch = stage.batch()
     message = stage.answer(batch)

@@ -41,17 +41,17 @@ class Gate:
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, object: str, after: int):
         self.reached, self.open, self.left = threading.Event(), threading.Event(), after
-        took = FactorFetch._took
+        took = FactorFetch.took
 
         def held(fetch: FactorFetch, number: int, *rest: Any) -> bool:
-            if fetch._job.object == object and not self.open.is_set():
+            if fetch.job.object == object and not self.open.is_set():
                 if self.left == 0:
                     self.reached.set()
                     assert self.open.wait(60)
                 self.left -= 1
             return took(fetch, number, *rest)
 
-        monkeypatch.setattr(FactorFetch, "_took", held)
+        monkeypatch.setattr(FactorFetch, "took", held)
 
 
 def is_right(factor: Any, shift: float = 0.0) -> bool:
@@ -99,7 +99,7 @@ def test_the_worker_is_killed_in_the_middle(monkeypatch: pytest.MonkeyPatch, way
             driver.until(lambda: driver.failures, "the loss")
             assert driver.failures[0] == ("beam", "factorization of beam at step 1 was lost with worker first")
             gate.open.set()
-        driver.until(lambda: not link.dispatch._decoding, "the end of the fetch")
+        driver.until(lambda: not link.dispatch.decoding, "the end of the fetch")
         assert driver.factors == [] and link.slots_lent == 0
         with light_worker(endpoint, "second", way):
             assert is_right(driver.factor(BEAM, 2))
@@ -122,7 +122,7 @@ def test_a_worker_that_stops_is_given_up_and_answers_again_later(monkeypatch: py
         os.kill(worker.pid, signal.SIGCONT)
         assert "did not come from worker light" in driver.failures[0][1] or "lost" in driver.failures[0][1]
         assert is_right(driver.factor(BEAM, 2, 0.5), 0.5)
-        driver.until(lambda: not link.dispatch._decoding, "the end of the fetch")
+        driver.until(lambda: not link.dispatch.decoding, "the end of the fetch")
         assert link.slots_lent == 0
 
 
@@ -160,8 +160,8 @@ def test_who_announces_and_sends_nothing_is_passed_over(monkeypatch: pytest.Monk
         with light_worker(endpoint):
             driver.until(lambda: len(link.dispatch.workers()) == 2, "the other worker")
             driver.until(lambda: link.dispatch.reassigned() == ["beam"], "the job to be free")
-            driver.until(lambda: not link.dispatch._decoding, "the end of the fetch")
-            assert link.dispatch._reliability.failing_objects == {"beam"}, "it is held against who sent nothing"
+            driver.until(lambda: not link.dispatch.decoding, "the end of the fetch")
+            assert link.dispatch.reliability.failing_objects == {"beam"}, "it is held against who sent nothing"
             hand.close()
             assert is_right(driver.factor(BEAM, 2)) and driver.factors[0].worker == "light"
 
@@ -298,7 +298,7 @@ def test_what_never_completes_is_dropped_with_the_reason(
         hand.answer(answer)
         driver.until(lambda: driver.failures, "the refusal")
         assert "was refused" in driver.failures[0][1] and told in driver.failures[0][1]
-        assert driver.factors == [] and link.dispatch._decoding == [] and link.slots_lent == 0
+        assert driver.factors == [] and not link.dispatch.decoding and link.slots_lent == 0
         driver.submit(BEAM, 2)
         answer, values = hand.right_answer(hand.receive(), BEAM)
         hand.answer(answer, values)  # whole, as an older worker does

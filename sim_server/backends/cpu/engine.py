@@ -93,7 +93,7 @@ class NativeFactor:
     def __init__(self, pattern: FactorPattern | NativePattern, values: NDArray[Any], step: int = -1):
         self._pattern = pattern if isinstance(pattern, NativePattern) else NativePattern(pattern)
         self.pattern = self._pattern.pattern
-        self.values = values
+        self.values, self._taken = values, False
         self.native = structs.Factor(
             pattern=c.addressof(self._pattern.native), values=values.ctypes.data, step=step, bytes=values.itemsize
         )
@@ -112,12 +112,17 @@ class NativeFactor:
     def fill(self, values: NDArray[Any], step: int) -> None:
         """Takes the values of L made from the matrix of `step`: copies them, or keeps those of a large factor, which
         would fill the memory once more."""
-        if values.nbytes > KEPT:
-            self.values = np.ascontiguousarray(values)
-            self.native.values = self.values.ctypes.data
-        else:
-            self.values[:] = values
+        if values.nbytes > KEPT or self._taken:  # those that were taken over are not ours to write to
+            self.take(values if values.nbytes > KEPT else values.copy(), step)
+            return
+        self.values[:] = values
         self.native.step = step
+
+    def take(self, values: NDArray[Any], step: int) -> None:
+        """Takes over the values, which do not change any more, instead of a copy: that of a large body takes as long as
+        many rounds of the service thread."""
+        self.values, self._taken = np.ascontiguousarray(values), True
+        self.native.values, self.native.step = self.values.ctypes.data, step
 
     def apply(self, r: Reals, threads: int = 1) -> Reals:
         """P^-1 r, (size,), outside of any step, on so many threads at most. A probe for tests and benchmarks."""
@@ -780,9 +785,12 @@ class CpuEngine(Reports):
         self._native.wf_post_factor(c.byref(self._body[body]), buffer.address)
 
     def post_factors(self, bodies: Sequence[int], factors: Sequence[Factor]) -> None:
-        """Posts factors of different bodies, one of each."""
+        """Posts factors of different bodies, one of each, whose values the loop reads in place."""
         for body, factor in zip(bodies, factors, strict=True):
-            self.post_factor(body, factor.pattern, factor.values, factor.step)
+            buffer = self._free_buffer(body, factor.pattern, factor.values.dtype)
+            buffer.take(factor.values, factor.step)
+            self._mail[body].waiting = buffer
+            self._native.wf_post_factor(c.byref(self._body[body]), buffer.address)
 
     def prepare_for_factors(self) -> None:
         """Does nothing."""

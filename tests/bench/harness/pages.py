@@ -25,6 +25,7 @@ PAGES = (
     "factors",
     "scheduler",
     "scaling",
+    "service",
     "haptics",
     "gallery",
     "web",

@@ -1,14 +1,11 @@
 # SPDX-License-Identifier: MIT
-"""What the thread that serves a loop can take in: factors a second of many small beams, at the pace of a GPU.
+"""A server of many small beams whose loop is a clock, and a worker that answers at once.
 
-The loop is a stand-in: at `rate` steps a second it reports a solve of each beam, whose iterations grow with the age of
-its factor, and copies the matrices that were asked for. The rest is the product: the driver, the network in a process
-of its own that answers at once (instant_worker.py), shared memory, checks, mailboxes. The time of the stand-in is not
-counted.
+At `rate` steps a second the loop reports a solve of each beam, whose iterations grow with the age of its factor, and
+copies the matrices that were asked for. The rest is the product: the driver, the network, a worker in a process of its
+own (instant_worker.py), shared memory, checks, mailboxes.
 """
 
-import argparse
-import json
 import socket
 import subprocess
 import sys
@@ -32,16 +29,16 @@ from sim_server.simulation import Simulation
 from sim_server.updates.driver import Driver
 from tests.bench.gpu.problem import Problem
 
-SIZES = (64, 256, 512, 1024)
 MOST_STEPS = 8  # that are reported together, as the ring of a loop with a thousand bodies holds
 SWING = 100.0  # steps in which an old factor becomes useless
 WORST = 40.0  # iterations with such a one
 
-Row = dict[str, Any]
-
 
 class PacedLoop:
-    """An engine in whose place of steps there is a clock. spent: processor time of its own [s]."""
+    """An engine in whose place of steps there is a clock.
+
+    spent: processor time of its own [s]. stepping: it is at its own work
+    """
 
     def __init__(self, sim: Simulation, rate: float):
         self._engine, self._rate, self.spent = sim.engine, rate, 0.0
@@ -55,7 +52,7 @@ class PacedLoop:
         self._copied = np.full(bodies, -1)
         self._factors = np.full(bodies, -1)
         self._worst = WORST * (1 + np.arange(bodies) % 8 / 8)
-        self.posted = 0
+        self.posted, self.stepping = 0, False
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._engine, name)
@@ -76,13 +73,13 @@ class PacedLoop:
 
     def records_and_reactions(self) -> tuple[NDArray[Any], NDArray[np.float64]]:
         """Records of the steps that are due."""
-        begin = time.thread_time()
+        begin, self.stepping = time.thread_time(), True
         due = int((time.monotonic() - self._begun) * self._rate)
         made = [self._one_step() for _ in range(min(due, MOST_STEPS))]
         if due:
             self._begun = time.monotonic()
         records = np.concatenate(made) if made else np.zeros(0, RECORD)
-        self.spent += time.thread_time() - begin
+        self.spent, self.stepping = self.spent + time.thread_time() - begin, False
         return records, np.zeros((len(records), 0, 6))
 
     def _one_step(self) -> NDArray[Any]:
@@ -116,7 +113,7 @@ class Served:
         for body in sim.world.bodies:
             self.link.announce(messages.topology(sim, body))
         self.driver = Driver(sim, self.link.dispatch)
-        module = "tests.bench.scaling.instant_worker" if instant else "precond_worker"
+        module = "tests.bench.service.instant_worker" if instant else "precond_worker"
         self._command = [sys.executable, "-m", module, "--connect", endpoint, "--server", "bench", "--name", "instant"]
 
     def __enter__(self) -> Self:
@@ -133,44 +130,3 @@ class Served:
         records = self.driver.pump()
         time.sleep(ROUND_PERIOD)
         return records
-
-
-def measure(beams: int, tets: int, rate: float, seconds: float, instant: bool = True, first: float = 60.0) -> Row:
-    """Measures for `seconds` after all beams have had a factor, or `first` seconds at most."""
-    with Served(beams, tets, rate, instant) as served:
-        driver, loop = served.driver, served.loop
-        end = time.monotonic() + first
-        while any(state.factors.used == 0 for state in driver.bodies) and time.monotonic() < end:
-            served.round()
-        without = sum(state.factors.used == 0 for state in driver.bodies)
-        rounds, found = 0, []
-        posted, spent, busy, begun, step = loop.posted, loop.spent, time.thread_time(), time.monotonic(), loop.step
-        while time.monotonic() < begun + seconds:
-            found.append(served.round())
-            rounds += 1
-        lasted, busy = time.monotonic() - begun, time.thread_time() - busy - (loop.spent - spent)
-        factors, steps = loop.posted - posted, loop.step - step
-    r = np.concatenate(found)
-    age = (r["step"] - 1 - r["factor_step"])[r["factor_step"] >= 0]
-    return {
-        "beams": beams, "tets": tets, "steps/s": steps / lasted, "factors/s": factors / lasted,
-        "service us/factor": 1e6 * busy / max(factors, 1), "service us/round": 1e6 * busy / rounds,
-        "factors/round": factors / rounds, "busy": busy / lasted, "without": without,
-        "age p50": float(np.percentile(age, 50)), "age p99": float(np.percentile(age, 99)), "age max": int(age.max()),
-    }  # fmt: skip
-
-
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--objects", type=int, nargs="+", default=list(SIZES))
-    parser.add_argument("--tets", type=int, default=540)
-    parser.add_argument("--rate", type=float, default=400.0)
-    parser.add_argument("--seconds", type=float, default=4.0)
-    parser.add_argument("--real", action="store_true")
-    o = parser.parse_args()
-    for beams in o.objects:
-        print(json.dumps(measure(beams, o.tets, o.rate, o.seconds, not o.real)), flush=True)
-
-
-if __name__ == "__main__":
-    main()
