@@ -9,7 +9,7 @@ import math
 import random
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 
 import zenoh
 
@@ -109,7 +109,7 @@ class Pool:
         elif missed - proven_before:
             self._try_again = now + self._pause
             self._pause = min(2 * self._pause, LONGEST_PAUSE)
-        seats = self._seats(needs, now)
+        seats = self._seats(needs, sent, now)
         unproven = [name for name in silent if not trust.is_proven(name) and not trust.is_avoided(name, now)]
         served = [*seats, *(name for name in silent if trust.is_proven(name)), *unproven[:TRIED]][:MAX_SERVERS]
         proven = sum(map(trust.is_proven, served))
@@ -121,8 +121,11 @@ class Pool:
         """Avoids a server for a while, since it cannot be served."""
         self._trust.reject(server, self._clock())
 
-    def _seats(self, needs: Mapping[str, ServerNeed], now: float) -> list[str]:
-        """Returns the seats that the choice takes; while it tries a server, those that it had before, too."""
+    def _seats(self, needs: Mapping[str, ServerNeed], served: Collection[str], now: float) -> list[str]:
+        """Returns the seats that the choice takes; while it tries a server, those that it had before, too.
+
+        served: servers that this worker serves now, also without a seat, as those that told no need
+        """
         trust = self._trust
         shown = {}
         needed = any(trust.is_proven(name) and need.lost > LEAST for name, need in needs.items())
@@ -141,7 +144,7 @@ class Pool:
             self._kept, self._tried = seats, ()
             return list(seats)
         if proven_seats:
-            self._kept = kept or tuple(name for name in self._tried if name in proven_seats)
+            self._kept = kept or tuple(name for name in proven_seats if name in served)
             return list(dict.fromkeys((*seats, *self._kept)))
         others = [name for name in shown if shown[name].lost > LEAST and name not in seats]
         tried = [name for name in self._tried if name in others]

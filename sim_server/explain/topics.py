@@ -7,7 +7,7 @@ log are stand-ins that note keys, below the code that makes them. No step is mad
 """
 
 import copy
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from types import SimpleNamespace
 from typing import Any
@@ -24,6 +24,7 @@ from sim_server.network.link import ServerLink
 from sim_server.network.publishers import Publishers
 from sim_server.network.queryables import QUERYABLES
 from sim_server.recording import messages
+from sim_server.recording.pieces import Record
 from sim_server.recording.recorder import Recorder
 from sim_server.service.commands import Commands
 from sim_server.service.telemetry import Telemetry
@@ -71,11 +72,12 @@ class NotedRecorder(Recorder):
 
     def __init__(self) -> None:
         self.found = set[str]()
-        self.dropped = self.lost = self.written = self._time = 0
+        self.dropped = self.lost = self.written = self.thinned = self._time = 0
+        self._waiting_bytes = self._frame_bytes = 0
         self.failure = ""
 
-    def _append(self, topic: str, *_: object, **__: object) -> bool:
-        self.found.add(topic)
+    def _put(self, records: Sequence[Record], *_: object, **__: object) -> bool:
+        self.found |= {record.topic for record in records}
         return True
 
 

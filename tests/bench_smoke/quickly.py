@@ -19,7 +19,7 @@ UNKNOWN_IN = {  # of other steps; without a goal; of a step not ours; without CH
     "cpu": ("iterations", "residual", "wall"), "factors": ("of CHOLMOD",), "rosenbrock": ("energy", "estimate"),
 }  # fmt: skip
 TIME = float(os.environ.get("PYTEST_TIMEOUT", 120)) - 10  # s, less than the test may take
-WITHOUT_PICTURE = ("faults", "gallery")
+WITHOUT_PICTURE = ("faults", "gallery", "service")
 
 
 def bench(name: str, out: Path, *arguments: str) -> dict[str, Any]:

@@ -126,6 +126,21 @@ def test_it_still_goes_where_it_is_needed_most() -> None:
     network.run(100, holds("b"))
 
 
+def test_a_server_that_told_no_need_stays_served_when_somebody_tells_one_in_its_name() -> None:
+    """It had no seat until then, so that none is kept while others are tried."""
+    network = Network()
+    network.token("sim")
+    for _ in range(20):
+        network.now += 0.5
+        shares = network.pool.wanted(network.sent)
+        network.sent = {name: Sent(network.sent.get(name, Sent(0, False)).factors + 1, False) for name in shares}
+    assert shares == {"sim": 1.0}
+    network.attack(6)
+    network.tell("sim", 0.0, 0.0)
+    network.real["sim"] = 0.0
+    network.run(100, holds("sim"))
+
+
 @pytest.mark.parametrize("lost", [0.0, 64.0])
 def test_needs_in_the_name_of_another_neither_starve_nor_feed_it(lost: float) -> None:
     """Who speaks in the name of a server that speaks itself is found out: it is served in turn with the others."""
