@@ -46,16 +46,21 @@ class FirstFactors:
         engine = self._driver.engine
         engine.assemble()
         begun = seen = self.begun = self._clock()
-        while self._waiting and not engine.loop.stop:
-            self._look()
+        while not engine.loop.stop:
+            held = self._stand_still()
+            if self._waiting:
+                self._look()
             now = self._clock()
             seen = now if self._driver.source.worker_count() else seen
-            if not self._waiting or now - begun > TIMEOUT or now - seen > WORKER_TIMEOUT:
+            over = not self._waiting or now - begun > TIMEOUT or now - seen > WORKER_TIMEOUT
+            if over and not held:
                 break
             self._sleep(1e-3)
         self.seconds = self._clock() - begun
         if engine.loop.stop:
             return False
+        if engine.loop.pause:
+            engine.loop.single -= 1  # this step is one of those that are made in a pause
         for name in self._waiting:
             self._leave(self._driver.by_name[name])
         engine.settle_factors()
@@ -63,6 +68,12 @@ class FirstFactors:
         engine.solve()
         self.done = True
         return True
+
+    def _stand_still(self) -> bool:
+        """Says in the loop's place that it stands still in a pause, as long as no single step is to be made."""
+        loop = self._driver.engine.loop
+        loop.halted = loop.pause if loop.single <= 0 else 0
+        return bool(loop.halted)
 
     def _look(self) -> None:
         """Takes up factors that have come, and gives matrices to idle workers, those of large bodies first."""
