@@ -38,6 +38,14 @@ def get(port: int, path: str = "/metrics") -> str:
         return str(answer.read().decode())
 
 
+def serves(port: int) -> bool:
+    """True once somebody listens: a server takes clients a moment before."""
+    try:
+        return bool(get(port))
+    except urllib.error.URLError:
+        return False
+
+
 def scrape(port: int) -> Found:
     return {
         (sample.name, tuple(sorted(sample.labels.items()))): sample.value
@@ -51,6 +59,7 @@ def test_a_scrape_counts_what_the_log_has(stage: Stage, tmp_path: Path) -> None:
     record = tmp_path / "run.mcap"
     server = stage.server(beam(tmp_path), "--record", str(record), "--metrics", str(at_server))
     with stage.client() as client:
+        until(lambda: serves(at_server), "the metrics are there")
         until(lambda: scrape(at_server)["warpfactor_need_seconds", ()] > 0, "a need of factors, without a worker")
         stage.worker("w1", "--metrics", f"127.0.0.1:{at_worker}")
         until(lambda: fresh(client).objects[0].factors_used >= 5, "factors")

@@ -91,7 +91,9 @@ def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_the_same_bit_for_bit(log: Path) -> None:
     found = replayed(log, 0)
     assert found["same"] and found["first"] is None and not found["notes"]
-    assert (found["steps"], found["frames"]) == (STEPS, STEPS + 1)
+    with Log(log) as opened:
+        frames = sum(1 for _ in opened.frames("cube"))  # a busy machine may leave some out
+    assert (found["steps"], found["frames"]) == (STEPS, frames) and frames > STEPS / 2
 
 
 @pytest.mark.parametrize("scheme", ["ros2", "bdf2"])
@@ -146,10 +148,11 @@ def test_the_log_tells_poses_contacts_and_reactions(log: Path, tmp_path: Path) -
     with Log(log) as opened:
         assert opened.notes == [] and set(opened.obstacles) == {"floor", "tool"}
         assert opened.obstacles["tool"].moved == "client" and opened.obstacles["tool"].size == (0.1,)
-        poses = opened.poses["tool"]
-        assert [pose.step for pose in poses] == list(range(STEPS + 1)) and set(opened.poses) == {"tool"}
+        poses, frames = opened.poses["tool"], [frame.step for frame in opened.frames("cube")]
+        assert [pose.step for pose in poses] == frames and set(opened.poses) == {"tool"}
+        assert frames[0] == 0 and frames[-1] == STEPS and len(frames) > STEPS / 2, "a busy machine may leave some out"
         height = np.array([pose.pose.position[1] for pose in poses])
-        assert np.abs(np.diff(height)).max() <= 0.4 * DT * 1.001, (
+        assert np.abs(np.diff(height) / np.diff(frames)).max() <= 0.4 * DT * 1.001, (
             "no faster than max_speed: each pose is of its frame's step"
         )
         assert height.min() < 0.4
