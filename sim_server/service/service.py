@@ -55,7 +55,8 @@ ROUND_PERIOD = 1e-3  # s that the service thread sleeps between rounds
 HOLD_PERIOD = 1e-4  # the same while the loop is to stand still
 WORKERS_PERIOD = 0.02  # s between checks of local workers
 SILENT_WAIT = 0.5  # s of waiting for first factors before a line tells of it
-STATUS_INTERVAL = 0.02  # s between two statuses that clients request, at least
+STATUS_REST = 3  # times that a status on request took until the next one, so that a quarter of the time goes into them
+STATUS_INTERVAL = 0.02  # s of that at most
 MAX_SETS = 64  # commands that wait to set parameters
 LOOP_NICE = -5  # of the loop's thread in real time: before workers, clients and our own threads on a full machine
 ENDLESS = 1 << 62
@@ -297,9 +298,10 @@ class Service:
 
     def _publish_status(self) -> None:
         """Publishes one status for all requests since the last: it costs more than any other command."""
-        if self._status_replies and time.monotonic() >= self._status_due:
+        if self._status_replies and (begin := time.monotonic()) >= self._status_due:
             self.telemetry.publish_status(self._state(), where=True)
-            self._status_due = time.monotonic() + STATUS_INTERVAL
+            end = time.monotonic()
+            self._status_due = end + min(STATUS_REST * (end - begin), STATUS_INTERVAL)
             for reply in self._status_replies:
                 reply(pb.Reply())
             self._status_replies.clear()
