@@ -52,10 +52,10 @@ def _worker_command(name: str, listen: list[str] | None, tls: str | None) -> str
 
 def summary(service: Service) -> str:
     """Returns times of steps, use of factors and what went wrong, for the end of a run."""
-    p50, p99, most = (1e3 * s for s in service.telemetry.percentiles())
+    p50, p99, most = (1e3 * s for s in service.telemetry.summary.percentiles())
     used = sum(state.factors.used for state in service.driver.bodies)
     return (
-        f"{service.engine.step} steps; last {len(service.telemetry.seconds)}: p50 {p50:.3f}, p99 {p99:.3f}, "
+        f"{service.engine.step} steps; last {len(service.telemetry.summary.seconds)}: p50 {p50:.3f}, p99 {p99:.3f}, "
         f"max {most:.3f} ms; {used} factors used, {service.engine.loop.late_steps} late steps; "
         f"{_unconverged(service)}{_runaways(service)}"
     )
@@ -63,14 +63,14 @@ def summary(service: Service) -> str:
 
 def _unconverged(service: Service) -> str:
     """Returns how many solves did not reach the tolerance, by cause."""
-    counts = service.telemetry.unconverged
+    counts = service.telemetry.warnings.unconverged
     if not counts:
         return "all solves converged"
     why = ", ".join(f"{n} {status}" for status, n in counts.most_common())
-    return f"{sum(counts.values())} of {service.telemetry.solves} solves not converged ({why})"
+    return f"{sum(counts.values())} of {service.telemetry.warnings.solves} solves not converged ({why})"
 
 
 def _runaways(service: Service) -> str:
     """Returns the names of objects that have run away; empty if none have."""
-    names = [service.simulation.world.bodies[body].name for body in sorted(service.telemetry.runaways)]
+    names = [service.simulation.world.bodies[body].name for body in sorted(service.telemetry.warnings.runaways)]
     return f"; run away: {', '.join(names[:20])}" if names else ""
