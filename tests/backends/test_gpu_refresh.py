@@ -39,6 +39,41 @@ def run(solver: Solver, library: c.CDLL, steps: int) -> list[tuple[int, int, int
     return found
 
 
-@pytest.mark.parametrize("blocks", [1, 3])
-def test_look(library, monkeypatch, blocks):
-    print(run(Solver(falling(), monkeypatch, blocks=blocks, refreshed=True), library, 12))
+@pytest.mark.parametrize(("blocks", "near"), [(1, 0), (3, 0), (3, 240)])
+def test_a_slow_solve_goes_on_with_an_exact_one_where_the_body_has_changed_most(library, monkeypatch, blocks, near):
+    """Those that follow with the same factor begin with it. near: S is made in memory of the inverse."""
+    found = run(Solver(falling(), monkeypatch, near=near, blocks=blocks, refreshed=True), library, 11)
+    used = [nodes for *_, nodes in found]
+    first = next(k for k, nodes in enumerate(used) if nodes)
+    assert 0 < first < len(used) - 1 and all(0 < nodes <= MOST for nodes in used[first:])
+    assert all(abs(ours - theirs) <= 1 for ours, theirs, nodes in found if not nodes), "nothing changes without"
+    assert all(ours < 0.8 * theirs for ours, theirs, _ in found[first + 1 :]), found
+
+
+def test_a_new_factor_is_enough_again(library, monkeypatch):
+    solver = Solver(falling(), monkeypatch, refreshed=True)
+    assert run(solver, library, 11)[-1][2] > 0
+    solver.post(solver.matrix, 10)
+    ours, theirs = solver.solve(library)
+    assert solver.used == 0 and abs(int(ours["iterations"]) - int(theirs["iterations"])) <= 1
+
+
+@pytest.mark.parametrize("forgotten", ["the matrix", "the step"])
+def test_a_factor_whose_matrix_is_not_known_stays_as_it_is(library, monkeypatch, forgotten):
+    solver = Solver(falling(), monkeypatch, refreshed=True)
+    if forgotten == "the step":
+        solver.refresh.params["kept"] = 4
+    run(solver, library, 6)
+    if forgotten == "the matrix":
+        solver.refresh._memory["noted"][...] = -1
+    for _ in range(5):
+        ours, theirs = solver.solve(library)
+        assert solver.used == 0 and abs(int(ours["iterations"]) - int(theirs["iterations"])) <= 1
+
+
+def test_more_nodes_than_there_is_room_for_are_fewer_that_changed_more(library, monkeypatch):
+    """Levels of change are raised until few enough nodes are above; the scores of all are told here."""
+    solver = Solver(falling(), monkeypatch, refreshed=True)
+    run(solver, library, 11)
+    score = np.asarray(solver.refresh._memory["score"])
+    assert solver.used == (score > REFRESH.constant("CHANGED")).sum() < MOST

@@ -496,6 +496,11 @@ class GpuEngine(DeviceLoop):
         """Returns the bytes of the inverse that one application reads."""
         return self.solver.factor_bytes(body)
 
+    def refreshed(self, body: int) -> int:
+        """Number of nodes on which the last solve was exact beside its factor. A probe for tests; only while the loop
+        stands still."""
+        return self._refresh.used(body) if self._refresh else 0
+
     def correct(
         self, body: int, nodes: int, diagonal: Float64, double: bool = False, block: Float64 | None = None
     ) -> None:

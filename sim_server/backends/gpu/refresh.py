@@ -54,6 +54,10 @@ class LocalRefresh:
             self.params[name] = array.data.ptr
         self.params["kept"], self.params["nodes"] = kept, nodes
 
+    def used(self, body: int) -> int:
+        """Number of nodes of a body on which its last solve was exact."""
+        return int(self.bodies.get().view(REFRESHED_BODY)["used"][body])
+
     def state(self) -> list[StateArray]:
         """Returns what is known of the matrices of factors, which earlier checkpoints lack."""
         found = device_arrays("engine.refresh", self._memory, "bodies", "blocks_then", "noted")
