@@ -39,7 +39,7 @@ def run(solver: Solver, library: c.CDLL, steps: int) -> list[tuple[int, int, int
     return found
 
 
-@pytest.mark.parametrize(("blocks", "near"), [(1, 0), (3, 0), (3, 240)])
+@pytest.mark.parametrize(("blocks", "near"), [(1, 0), (3, 0), (3, 40)])
 def test_a_slow_solve_goes_on_with_an_exact_one_where_the_body_has_changed_most(library, monkeypatch, blocks, near):
     """Those that follow with the same factor begin with it. near: S is made in memory of the inverse."""
     found = run(Solver(falling(), monkeypatch, near=near, blocks=blocks, refreshed=True), library, 11)

@@ -711,11 +711,11 @@ struct PcgSolver {
 
     // The first thread block takes the memory of its part of the inverse, if that is large enough.
     __device__ __forceinline__ void invert_on_changes(double* a) {
-        const bool fits = 8ll * REFRESH_ROOM <= 512ll * memory.inverse.near;
+        const int n = 3 * memory.refresh.used;
+        const bool fits = 8ll * n * (n + 6) <= 512ll * memory.inverse.near;
         copies_end<0>();
         __syncthreads();
         if (fits) fetched = arrived = false;
-        const int n = 3 * memory.refresh.used;
         const bool made = make_local_inverse(n, a, fits ? (double*)memory.inverse.kept : nullptr, local_inverse());
         if (threadIdx.x == 0) __stcg(&refresh.bodies[body].used, made ? memory.refresh.used : 0);
     }
