@@ -362,6 +362,23 @@ def test_records_that_nobody_fetches_are_dropped_by_whole_steps_and_counted():
     assert len(kept) + scene.loop.loop.records_dropped == 120
 
 
+def test_records_are_written_by_batches_where_there_is_room_and_else_by_steps():
+    scene = FakeScene(bodies=3, records=3 * (2 * BATCH + 5))
+    graphs = launched(scene)
+    scene.loop.run(2 * BATCH)
+    by_batches = sum(graph in RECORD_GRAPHS for graph in graphs)
+    assert by_batches == scene.loop.loop.finished
+    scene.loop.run(BATCH)  # there is room for five steps
+    assert sum(graph in RECORD_GRAPHS for graph in graphs) == scene.loop.loop.finished + 5
+    records = scene.loop.records()
+    assert records["step"].tolist() == np.repeat(np.arange(1, 2 * BATCH + 6), 3).tolist()
+    assert scene.loop.loop.records_dropped == 3 * (BATCH - 5)
+    scene.loop.run(BATCH)
+    records = scene.loop.records()
+    assert records["step"].tolist() == np.repeat(np.arange(3 * BATCH + 1, 4 * BATCH + 1), 3).tolist()
+    np.testing.assert_allclose(records["residual"], 1e-7 * (records["step"] - 1))
+
+
 @pytest.mark.parametrize("real", ["f4", "f8"])
 def test_matrices_are_those_of_the_step_after_the_request_in_all_bodies(real):
     scene = FakeScene(bodies=3, real=real)
