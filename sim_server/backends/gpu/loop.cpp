@@ -247,7 +247,8 @@ static void report(GpuLoop& l, StepBatch& batch, int64_t k, double end, double c
 
 static bool finish_batch(GpuLoop& l) {
     StepBatch& batch = l.batches[l.finished % STEP_BATCHES];
-    if (!await(l, batch.done, l.idle_since + l.step_seconds * batch.steps)) return false;
+    const double lasts = l.step_seconds * batch.steps;
+    if (!await(l, batch.done, l.idle_since + lasts, lasts)) return false;
     double end = l.idle_since = now(), cpu = thread_time();
     const StepTimestamp &first = l.timestamps[batch.first % l.capacity], &last = l.timestamps[(batch.first + batch.steps - 1) % l.capacity];
     l.step_seconds = 1e-9 * (last.end - first.begin) / batch.steps;

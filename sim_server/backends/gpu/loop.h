@@ -151,13 +151,14 @@ static bool done(GpuLoop& l, void* event) {
     return !failed(l, answer, "event_query");
 }
 
-// Waits for an event without a busy loop: sleeps until about when it is due, then queries it at intervals.
-static bool await(GpuLoop& l, void* event, double due = 0) {
+// Waits for an event without a busy loop: sleeps until about when it is due, then queries it at intervals, which are longer where the
+// work before it lasts longer. due: steady clock [s]. lasts [s]
+static bool await(GpuLoop& l, void* event, double due = 0, double lasts = 0) {
     for (double begin = now(), t = begin; !done(l, event); t = now()) {
         if (l.error) return false;
         double over = t - (due > begin ? due : begin);
         if (over > 1) { CALL(event_wait, event); return true; }
-        nap(over < 0 ? -over : l.poll + over / 8);
+        nap(over < 0 ? -over : l.poll + lasts / 64 + over / 8);
     }
     return !l.error;
 }
