@@ -69,8 +69,9 @@ struct PartitionedInverse {
     FlagWord<float> *residual, *product, *z;
     uint4* kept;
     int size, phases, near, first, last;  // own rows
-    void reserve(const DevicePlan*, Arena&) {}
-    void set_up(const PcgBody& body, const DevicePlan* plan, int index, Arena& arena) {
+    const DevicePlan* plan;
+    void reserve(const DevicePlan* shared_plan, int, Arena&) { plan = shared_plan; }
+    void set_up(const PcgBody& body, int index, Arena& arena) {
         size = plan->size; first = index * size / body.blocks; last = (index + 1) * size / body.blocks;
         phases = 1; scale = body.scale; matrix = (const float*)body.matrix;
         residual = body.residual; product = body.product; z = body.z;

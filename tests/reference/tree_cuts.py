@@ -18,6 +18,7 @@ MEMORY, CACHE, SHARED = 4400 / 132, 7000 / 132, 25000 / 132  # bandwidths of one
 CACHED = 25e6  # bytes that stay in the near half of the second-level cache
 KEPT, X_AREA = 0.83, 0.7  # share of a block's shared memory: for matrices and vectors; for vectors at most
 LOAD, LOAD_ENTRY = 250.0, 0.4  # time of loading the vector of a part [ns]: constant, per entry
+LARGE, TILE = 100e6, 35.0  # bytes of matrices that no cache keeps; constant time of a tile of theirs [ns]
 FLOPS, USES = 10e3, 3000  # of building the inverse: float32 operations per ns; applications that share its time
 CUT_GAIN = 1.1  # matrices are cut anywhere only if whole ones take this many times as long
 MANY = 8  # matrices per block above which whole ones balance well enough
@@ -71,7 +72,7 @@ def phase_work(cut: Partition, planes: int) -> Iterator[tuple[Int64, PhaseWork]]
         forward, backward = phase < cut.groups - 1, phase >= cut.groups
         rows = padded(cut.b[which] if forward else cut.v[which], ROWS) // ROWS
         columns = inside[which] + outside[which] * backward
-        tile = columns * (2.0 * ROWS * planes) / rate
+        tile = columns * (2.0 * ROWS * planes) / rate + (TILE if _bytes(cut, planes) > LARGE else 0)
         yield which, PhaseWork(rows, tile, LOAD + LOAD_ENTRY * columns)
 
 

@@ -75,3 +75,13 @@ def test_plans_are_those_of_the_reference(graph, monkeypatch):
         mine = getattr(found, name)
         same = all(map(np.array_equal, mine, value)) if name == "parts" else np.array_equal(mine, value)
         assert same, name
+
+
+def test_tiles_of_large_matrices_have_a_constant_time_beside_that_of_their_bytes():
+    cut = reference.partition(random_tree(np.random.default_rng(3), 30), (200,))
+    for planes in (20_000, 40_000):  # as if each matrix was so many times as large
+        works = zip(tree_cuts.phase_work(cut, planes), reference.phase_work(cut, planes), strict=True)
+        assert all(np.array_equal(mine.tile, wanted.tile) for (_, mine), (_, wanted) in works)
+    twice = zip(tree_cuts.phase_work(cut, 20_000), tree_cuts.phase_work(cut, 40_000), strict=True)
+    for (_, one), (_, two) in twice:
+        np.testing.assert_allclose(2 * one.tile - two.tile, reference.TILE, rtol=1e-6)

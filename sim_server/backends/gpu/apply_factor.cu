@@ -154,9 +154,9 @@ __device__ __forceinline__ void apply_to_body(const PcgArguments& s, const Stage
         Arena arena = {shared_memory, shared_memory + s.shared};
         PartitionedInverse inverse;
         OwnPlaces own;
-        inverse.reserve(&memory.plan, arena);
+        inverse.reserve(&memory.plan, range.index, arena);
         own.set_up(range, body.scale, arena);
-        inverse.set_up(body, &memory.plan, range.index, arena);
+        inverse.set_up(body, range.index, arena);
         inverse.fetch();  // beside the exchange
         FactorApplication solver = {s, range, inverse, own,
                                     {range.index, body.blocks, s.exchange_number[k], s.block_sums + 8ll * s.grid * k, s.grid, memory.scratch,

@@ -66,8 +66,8 @@ __device__ __forceinline__ void apply_to_body(const PcgArguments& s, const Islan
         __syncthreads();
         Arena arena = {shared_memory, shared_memory + s.shared};
         PartitionedInverse inverse;
-        inverse.reserve(&memory.plan, arena);
-        inverse.set_up(body, &memory.plan, range.index, arena);
+        inverse.reserve(&memory.plan, range.index, arena);
+        inverse.set_up(body, range.index, arena);
         inverse.fetch();  // beside the exchange
         BlockGroup group = {range.index, body.blocks, s.exchange_number[k], s.block_sums + 8ll * s.grid * k, s.grid, memory.scratch,
                             memory.totals, (int)threadIdx.x % 32, (int)threadIdx.x / 32};

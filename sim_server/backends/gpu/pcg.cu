@@ -106,12 +106,12 @@ struct PcgSolver {
         Arena arena = {shared_memory, shared_memory + s.shared};
         PartitionedInverse inverse;
         const bool inverted = body.plan && (body.kind == CHOLESKY || body.probe > 0);
-        if (inverted) inverse.reserve(&memory.plan, arena);
+        if (inverted) inverse.reserve(&memory.plan, group.index, arena);
         BlockRows rows;
         rows.set_up(s, body, range, arena, inverted);
         real* diagonal = arena.take<real>(9 * rows.own);
         if (!diagonal) diagonal = s.diagonal + 9ll * (body.first + rows.begin);
-        if (inverted) inverse.set_up(body, &memory.plan, group.index, arena);
+        if (inverted) inverse.set_up(body, group.index, arena);
         if (threadIdx.x == 0) {
             memory.rows = rows;
             memory.inverse = inverse;

@@ -105,24 +105,25 @@ struct PartitionedInverse {
         return to;
     }
 
-    // Allocates what has to be in shared memory; solver.PcgSolver.plan has checked that it fits.
-    __device__ __forceinline__ void reserve(const DevicePlan* shared_plan, Arena& arena) {
+    // Allocates what has to be in shared memory, which solver.PcgSolver.plan has checked to fit, and what each tile waits for.
+    __device__ __forceinline__ void reserve(const DevicePlan* shared_plan, int index, Arena& arena) {
+        plan = shared_plan;
+        size = plan->size; phases = plan->phases; groups = plan->groups;
         vector.high = arena.take<unsigned short>(shared_plan->entries);
         vector.low = arena.take<unsigned short>(shared_plan->entries);
         tile_sums = arena.take<float>(16 * TILE_SUMS);
+        const BlockRanges part = plan->block_ranges[index];
+        lists = brought(plan->lists + index * (4 * phases + 2), 4 * phases + 2, arena);
+        tiles = brought(plan->tiles + part.tile, part.tiles, arena);
     }
 
-    __device__ __forceinline__ void set_up(const PcgBody& body, const DevicePlan* shared_plan, int index, Arena& arena) {
-        plan = shared_plan;
-        size = plan->size; phases = plan->phases; groups = plan->groups;
+    __device__ __forceinline__ void set_up(const PcgBody& body, int index, Arena& arena) {
         scale = body.scale; planes = body.planes;
         residual = body.residual; product = body.product; z = body.z;
         formed = body.formed; solved = body.solved; contributed = body.contributed;
         const BlockRanges part = plan->block_ranges[index];
-        lists = brought(plan->lists + index * (4 * phases + 2), 4 * phases + 2, arena);
         segments = brought(plan->segments + part.segment, part.segments, arena);
         where = brought(plan->index + 32ll * part.segment, 32 * part.segments, arena);
-        tiles = brought(plan->tiles + part.tile, part.tiles, arena);
         begin = part.chunk;
         matrix = body.matrix + 32ll * begin;
         near = (int)((arena.end - arena.next) / 512);  // chunks that fit into the rest of shared memory

@@ -24,6 +24,7 @@ const double MEMORY = 4400 / 132.0, CACHE = 7000 / 132.0, SHARED = 25000 / 132.0
 const double CACHED = 25e6;             // bytes that stay in the near half of the second-level cache
 const double KEPT = 0.83, X_AREA = 0.7; // share of a block's shared memory: for matrices and vectors; for vectors at most
 const double LOAD = 250, LOAD_ENTRY = 0.4;  // time of loading the vector of a part [ns]: constant, per entry
+const double LARGE = 100e6, TILE = 35;  // bytes of matrices of which no cache keeps much; constant time of a tile of theirs [ns]
 const double FLOPS = 10e3, USES = 3000; // of building the inverse: float32 operations per ns; applications that share its time
 const int64_t COLUMNS = 32, ROWS = 8;   // of a chunk (partition.py)
 const double CUT_GAIN = 1.1;            // matrices are cut anywhere only if whole ones take this many times as long
@@ -136,12 +137,13 @@ double bandwidth(const Cut& cut, int64_t planes) { return stored_bytes(cut, plan
 Work phase_work(const Cut& cut, int64_t phase, int64_t planes, double rate) {
     int64_t group = std::min(phase, 2 * cut.groups - 2 - phase);
     bool forward = phase < cut.groups - 1, backward = phase >= cut.groups;
+    double constant = stored_bytes(cut, planes) > LARGE ? TILE : 0;
     Work work;
     for (size_t p = 0; p < cut.v.size(); p++) {
         if (cut.group[p] != group) continue;
         int64_t columns = padded(cut.v[p], COLUMNS) + (backward ? padded(cut.b[p], COLUMNS) : 0);
         work.tiles.push_back(padded(forward ? cut.b[p] : cut.v[p], ROWS) / ROWS);
-        work.tile.push_back(double(columns) * (2.0 * ROWS * double(planes)) / rate);
+        work.tile.push_back(double(columns) * (2.0 * ROWS * double(planes)) / rate + constant);
         work.load.push_back(LOAD + LOAD_ENTRY * double(columns));
     }
     return work;
