@@ -29,7 +29,7 @@ from sim_server.backends.gpu.energies import DeviceEnergies
 from sim_server.backends.gpu.factor_upload import FactorUpload
 from sim_server.backends.gpu.held import HeldForces, leading
 from sim_server.backends.gpu.kernel_fusion import DOMAINS, Epilogue, FusedKernel, Prologue, fuse
-from sim_server.backends.gpu.loop import CAPACITY, MANY, DeviceLoop
+from sim_server.backends.gpu.loop import CAPACITY, GRAPH_STEPS, DeviceLoop
 from sim_server.backends.gpu.mailbox import ChangeMailbox, DeviceMailbox
 from sim_server.backends.gpu.measured import MeasuredReport
 from sim_server.backends.gpu.newton import NewtonIteration, NewtonPhases, begins_beside
@@ -54,7 +54,7 @@ from sim_server.backends.state import StateArray
 MOST_GRABS = 1024  # pushes and grabs at a time, of which forces are told
 MOST_TOLD = 16  # other bodies whose forces on a body are told, at most
 GRAB_BLOCKS, GRAB_THREADS = 32, 128  # of the kernel react (effects/touch.cu)
-FEW = 16  # largest number of trials in a step without loops for which MANY steps are captured in one graph
+FEW = 16  # largest number of trials in a step without loops for which several steps are captured in one graph
 EPILOGUE = Declarations("backends/gpu/step_epilogue.cu")
 STEP_EPILOGUE = EPILOGUE.dtype("StepEpilogue")
 
@@ -308,7 +308,7 @@ class GpuEngine(DeviceLoop):
         """Captures the graphs of the steps, of the energies and of the records."""
         many = self._newton is None or self._newton.loops or self._newton.rounds <= FEW
         for begin in (False, True):
-            for steps in (1, MANY):
+            for steps in GRAPH_STEPS:
                 if steps > 1 and not many:
                     self._graphs.append(None)
                     continue
