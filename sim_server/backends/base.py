@@ -252,6 +252,11 @@ class Engine(Protocol):
         """Begins what the first factor would wait for, without waiting."""
         ...
 
+    def factor_memory(self, count: int, dtype: np.dtype[Any]) -> NDArray[Any]:
+        """Makes an array for values of a factor, (count,), from which `post_factors` takes them with fewest copies.
+        From any thread."""
+        ...
+
     def expect_factors(self, body: int, pattern: FactorPattern) -> None:
         """Prepares for factors of a pattern that will come, without waiting."""
         ...

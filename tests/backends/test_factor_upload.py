@@ -45,6 +45,7 @@ class Maker:
         self.bodies = np.zeros(1, [("setting", "i8"), ("factor", "i8")])
         self.storages: list[list[int]] = []
         self.events: list[Event] = []
+        self.limits: list[int | None] = []  # multiprocessors of each build
         self.fail: Exception | None = None
         self.thread = ThreadPoolExecutor(1)
         self.planning: list[Future] | None = None  # plans that are not made yet; None: each is made at once
@@ -66,12 +67,13 @@ class Maker:
         self.storages.append([])
         return self.storages[-1]
 
-    spared = None
+    spared = 8
 
     def build(self, values: np.ndarray, storage: list[int], multiprocessors: int | None = None) -> PartitionedInverse:
         if self.fail:
             raise self.fail
         storage[:] = [int(values[0])]
+        self.limits.append(multiprocessors)
         self.events.append(Event(self.scene))
         return PartitionedInverse(storage, self.events[-1])
 
@@ -118,6 +120,15 @@ def test_a_factor_is_used_when_it_is_made(parts):
     scene.loop.run(1)
     assert upload.step(0) == 5
     assert used(scene) == [0, 5]
+
+
+@pytest.mark.parametrize(("realtime", "seconds", "limit"), [(1, 1e-4, None), (1, 0.9, 8), (0, 1e-4, 8), (1, 0.0, 8)])
+def test_builds_have_the_whole_device_where_steps_in_real_time_leave_it_idle(parts, realtime, seconds, limit):
+    """seconds: of a step; 0: not known yet."""
+    scene, maker, upload = parts
+    scene.loop.loop.realtime, scene.loop.loop.step_seconds, scene.loop.loop.dt = realtime, seconds, 1.0
+    post(upload, 5)
+    assert maker.limits == [limit]
 
 
 def test_what_comes_too_early_waits_and_the_newest_wins(parts):

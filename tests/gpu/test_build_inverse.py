@@ -78,6 +78,29 @@ def test_few_multiprocessors_make_the_same_bits(gpu):
     assert np.array_equal(all_chunks.view(np.uint16), chunks.view(np.uint16)) and np.array_equal(all_scale, scale)
 
 
+@pytest.mark.parametrize("count", [1, 3])
+def test_values_in_pinned_memory_make_the_same_bits(gpu, count):
+    """They are copied by the device itself; their memory may be given up, and used again, before that."""
+    from sim_server.backends.gpu.inverse.build_inverse import InverseBuilder
+    from sim_server.backends.gpu.pinned import PinnedArray, pinned_array
+
+    shape, values = factor(MIDDLE)
+    p = plan(shape, 132, 2)
+    chunks, scale = expanded(gpu, shape, values, p)
+    builder = InverseBuilder(gpu, shape, p)
+    storage = builder.storage()
+    for _ in range(count):
+        pinned = pinned_array(gpu.cp, len(values), np.dtype(np.float32))
+        pinned[:] = values
+        assert isinstance(pinned, PinnedArray)
+        made = builder.build(pinned, storage)
+        del pinned
+        pinned_array(gpu.cp, len(values), np.dtype(np.float32))[:] = 3  # other memory, as long as the copy lasts
+    made.event.synchronize()
+    assert np.array_equal(storage.matrix.get().view(np.uint16), chunks.view(np.uint16))
+    assert np.array_equal(storage.scale.get(), scale)
+
+
 def test_the_scale_ends_with_its_largest(gpu):
     shape, values = factor(SMALL)
     scale = expanded(gpu, shape, values, plan(shape, 16, 2))[1]

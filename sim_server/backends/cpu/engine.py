@@ -795,6 +795,10 @@ class CpuEngine(Reports):
     def prepare_for_factors(self) -> None:
         """Does nothing."""
 
+    def factor_memory(self, count: int, dtype: np.dtype[Any]) -> NDArray[Any]:
+        """Makes an array for values of a factor."""
+        return np.empty(count, dtype)
+
     def expect_factors(self, body: int, pattern: FactorPattern) -> None:
         """Does nothing: a factor is applied as it comes."""
 

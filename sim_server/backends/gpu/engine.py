@@ -32,6 +32,7 @@ from sim_server.backends.gpu.loop import CAPACITY, MANY, DeviceLoop
 from sim_server.backends.gpu.mailbox import ChangeMailbox, DeviceMailbox
 from sim_server.backends.gpu.measured import MeasuredReport
 from sim_server.backends.gpu.newton import NewtonIteration, NewtonPhases, begins_beside
+from sim_server.backends.gpu.pinned import pinned_array
 from sim_server.backends.gpu.rosenbrock import ATTEMPTS, RosenbrockStep
 from sim_server.backends.gpu.solver import PCG_BODY, PCG_RESULT, SETTINGS_BYTES, PcgSolver
 from sim_server.backends.gpu.splits import DeviceSplits, Staged
@@ -466,6 +467,10 @@ class GpuEngine(DeviceLoop):
     def prepare_for_factors(self) -> None:
         """Has the kernels that build inverses of factors compiled beside the caller."""
         self.solver.compile_builder()
+
+    def factor_memory(self, count: int, dtype: np.dtype[Any]) -> NDArray[Any]:
+        """Makes an array for values of a factor, from which the device copies them."""
+        return pinned_array(self.gpu.cp, count, dtype)
 
     def expect_factors(self, body: int, pattern: FactorPattern) -> None:
         """Begins to plan the inverses of factors of a pattern that will come, beside the caller."""

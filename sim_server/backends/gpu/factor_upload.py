@@ -29,6 +29,7 @@ log = logging.getLogger(__name__)
 
 SMALL = 1 << 20  # bytes of a factor that is copied at once
 MANY = 4  # small factors that come together, from which on none is built at once
+BUSY = 0.25  # share of dt that steps in real time take, up to which builds may have the whole device
 MAX_PATTERNS = 2  # of a body at a time; workers with different libraries send different patterns
 
 
@@ -206,8 +207,17 @@ class FactorUpload:
         builder = plan.result().builder
         storage = builder.storage() if spare is None else spare
         self._gpu.cp.cuda.get_current_stream().synchronize()  # new arrays are complete for other streams
-        inverse = builder.build(given.values, storage, self._solver.spared)  # beside the steps
+        inverse = builder.build(given.values, storage, self._multiprocessors)  # beside the steps
         return UploadedFactor(inverse, storage, given.step, given.pattern)
+
+    @property
+    def _multiprocessors(self) -> int | None:
+        """Multiprocessors that a build may keep busy: those that solves leave free; None: all, where steps in real time
+        leave the device idle most of the time. A step then waits some 100 us now and then, and the build is done the
+        sooner."""
+        loop = self._loop.loop
+        idle = loop.realtime and 0 < loop.step_seconds < BUSY * loop.dt
+        return None if idle else self._solver.spared
 
     def _finish(self, body: int, pattern: FactorPattern, build: Callable[[], UploadedFactor]) -> None:
         """Posts the factor that `build` returns, or warns if it cannot be used."""

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
 """Builds the partitioned inverse (plan.py) from the values of L on the device, beside the running steps.
 
-A build is one copy from pinned memory and one launch of a graph of the kernels in build_inverse.cu. Memory is allocated
-only when an InverseBuilder or an InverseStorage is made.
+A build is a copy or two from pinned memory and one launch of a graph of the kernels in build_inverse.cu. Memory is
+allocated only when an InverseBuilder or an InverseStorage is made.
 """
 
 from typing import Any, NamedTuple
@@ -17,6 +17,7 @@ from sim_server.backends.gpu.inverse.expansion_batches import EDGE, BuildBatch, 
 from sim_server.backends.gpu.inverse.partition import COLUMNS, ROWS
 from sim_server.backends.gpu.inverse.plan import Plan
 from sim_server.backends.gpu.inverse.workspace import workspace
+from sim_server.backends.gpu.pinned import PinnedArray
 
 HEAD = 16  # bytes in front of the values: the two addresses of a storage
 Groups = tuple[int, int, int, int]
@@ -106,12 +107,15 @@ class InverseBuilder:
         size = HEAD + 4 * self._nonzeros
         addresses = storage.matrix.data.ptr, storage.scale.data.ptr
         space.staging[:HEAD].view(np.uint64)[:] = addresses
-        space.staging[HEAD:size].view(np.float32)[:] = values
         graph, stream = self._graph(multiprocessors), space.stream
-        cp.cuda.runtime.memcpyAsync(
-            space.incoming.data.ptr, space.staging.ctypes.data, size, cp.cuda.runtime.memcpyHostToDevice, stream.ptr
-        )
-        space.copied = stream.record()
+        at, copy, kind = int(space.incoming.data.ptr), cp.cuda.runtime.memcpyAsync, cp.cuda.runtime.memcpyHostToDevice
+        if isinstance(values, PinnedArray) and values.dtype == np.float32 and values.flags.c_contiguous:
+            copy(at, space.staging.ctypes.data, HEAD, kind, stream.ptr)
+            copy(at + HEAD, values.ctypes.data, size - HEAD, kind, stream.ptr)
+        else:
+            space.staging[HEAD:size].view(np.float32)[:] = values
+            copy(at, space.staging.ctypes.data, size, kind, stream.ptr)
+        space.copied, space.source = stream.record(), values
         graph.launch(stream)
         return PartitionedInverse(*addresses, stream.record())
 
