@@ -71,6 +71,26 @@ def test_it_applies_as_the_triangular_solves_do(gpu, groups, planes, bound):
     assert np.linalg.norm(z - expected) <= bound * np.linalg.norm(expected)
 
 
+@pytest.mark.parametrize("planes", [1, 2])
+@pytest.mark.parametrize("groups", [1, 2, 3, 4])
+def test_one_application_beside_the_steps_is_that_of_the_solver(gpu, groups, planes):
+    from sim_server.backends.gpu.inverse.apply_inverse import InverseApplication
+    from sim_server.backends.gpu.inverse.build_inverse import InverseBuilder
+
+    shape, values = factor(MIDDLE, seed=1)
+    p = plan(shape, 132, groups, planes)
+    builder = InverseBuilder(gpu, shape, p)
+    storage = builder.storage()
+    made = builder.build(values, storage)
+    application = InverseApplication(gpu, p)
+    chunks, scale = expanded(gpu, shape, values, p)
+    for seed in range(3):
+        r = np.random.default_rng(seed).normal(size=shape.size)
+        z = application.begin(made.matrix, made.scale, r, builder._workspace.stream, 132 if seed else 1).result()
+        expected = Application(p, chunks, scale)(r)
+        assert np.linalg.norm(z - expected) <= 1e-5 * np.linalg.norm(expected)
+
+
 def test_few_multiprocessors_make_the_same_bits(gpu):
     shape, values = factor(MIDDLE)
     p = plan(shape, 132, 2)
