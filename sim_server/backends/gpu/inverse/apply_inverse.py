@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from sim_server.arrays import Float64
 from sim_server.backends.declarations import Declarations
-from sim_server.backends.gpu.cupy_types import Event, Stream
+from sim_server.backends.gpu.cupy_types import Event, KernelFunction, Stream
 from sim_server.backends.gpu.device import Gpu
 from sim_server.backends.gpu.inverse.partition import COLUMNS, ROWS, padded
 from sim_server.backends.gpu.inverse.plan import Plan
@@ -18,6 +18,12 @@ APPLICATION = Declarations("backends/gpu/inverse/apply_inverse.cu")
 TILE = APPLICATION.dtype("Tile")
 WARPS, BLOCKS = 8, 4  # of a thread block; thread blocks on a multiprocessor
 KERNELS = ("form", "product", "scale_back")
+
+
+def application_kernels(gpu: Gpu) -> dict[str, KernelFunction]:
+    """Returns the kernels of apply_inverse.cu by name, compiled. Raises CompileError."""
+    module = gpu.module("backends/gpu/inverse/apply_inverse.cu")
+    return {name: module.function(name) for name in KERNELS}
 
 
 class Applied(NamedTuple):
@@ -66,8 +72,7 @@ class InverseApplication:
         length = plan.size + COLUMNS  # a part's columns are padded
         self._r, self._s, self._y, self._z = (cp.zeros(length, np.float32) for _ in range(4))
         self._contributed = cp.zeros(plan.contributions + ROWS, np.float32)
-        module = gpu.module("backends/gpu/inverse/apply_inverse.cu")
-        self._functions = {name: module.function(name) for name in KERNELS}
+        self._functions = application_kernels(gpu)
         self._place = (plan.place[:, None].astype(np.int64) + np.arange(3)).ravel()
         self._sent = pinned_array(cp, length, np.dtype(np.float32))
         self._sent[:] = 0

@@ -11,8 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from protocol.factor import FactorPattern
+from sim_server.arrays import Float64
 from sim_server.backends.gpu.cupy_types import DeviceArray, Event, Graph, KernelFunction
 from sim_server.backends.gpu.device import Gpu
+from sim_server.backends.gpu.inverse.apply_inverse import Applied, InverseApplication, application_kernels
 from sim_server.backends.gpu.inverse.expansion_batches import EDGE, BuildBatch, workspace_layout
 from sim_server.backends.gpu.inverse.partition import COLUMNS, ROWS
 from sim_server.backends.gpu.inverse.plan import Plan
@@ -34,7 +36,8 @@ KERNELS: dict[str, Groups] = {
 
 
 def builder_kernels(gpu: Gpu) -> dict[str, KernelFunction]:
-    """Returns the kernels of build_inverse.cu by name, compiled. Raises CompileError."""
+    """Returns the kernels of build_inverse.cu by name, compiled, as is what applies inverses. Raises CompileError."""
+    application_kernels(gpu)
     return {name: gpu.module("backends/gpu/inverse/build_inverse.cu").function(name) for name in KERNELS}
 
 
@@ -73,6 +76,7 @@ class InverseBuilder:
         self._workspace = workspace(cp.cuda.Device().id)
         self._workspace.reserve(layout.size, HEAD + 4 * self._nonzeros)
         self._functions = builder_kernels(gpu)
+        self._application: InverseApplication | None = None
         self._graphs: dict[int | None, Graph] = {}
         self._generation = -1
         cp.cuda.get_current_stream().synchronize()  # the tables are there for the stream of builds, which does not wait
@@ -97,6 +101,14 @@ class InverseBuilder:
         """
         with self._workspace.lock:
             return self._begin(values, storage, multiprocessors)
+
+    def apply(self, inverse: PartitionedInverse, r: Float64, multiprocessors: int | None = None) -> Applied:
+        """Begins to apply an inverse that a build under way makes to r (n,); returns before it is complete."""
+        with self._workspace.lock:
+            if self._application is None:
+                self._application = InverseApplication(self._gpu, self.plan)
+            most = multiprocessors or self._gpu.properties["multiProcessorCount"]
+            return self._application.begin(inverse.matrix, inverse.scale, r, self._workspace.stream, most)
 
     def _begin(
         self, values: NDArray[np.floating], storage: InverseStorage, multiprocessors: int | None
