@@ -10,7 +10,7 @@ import pytest
 
 from protocol.messages_pb2 import SolveStatus
 from sim_server.errors import DeviceError
-from sim_server.service.telemetry import not_finite_lines
+from sim_server.service.step_warnings import not_finite_lines
 from sim_server.simulation import Simulation
 from sim_server.updates.driver import Driver
 from sim_server.updates.factor_source import Job

@@ -18,7 +18,7 @@ from protocol.messages_pb2 import FactorBatch, MatrixBatch
 from protocol.shared_memory.limits import obstacle
 from protocol.shared_memory.view import SlotMap
 from protocol.validate import checksum
-from sim_server.network import dispatch
+from sim_server.network import factor_intake, job_sender, worker_choice
 from sim_server.network.link import ServerLink
 from sim_server.updates.factor_source import Job
 
@@ -114,7 +114,7 @@ class Hand:
 @pytest.fixture(scope="module")
 def stage() -> Iterator[Hand]:
     patch = pytest.MonkeyPatch()
-    patch.setattr(dispatch, "QUEUE_SECONDS", 60.0)
+    patch.setattr(worker_choice, "QUEUE_SECONDS", 60.0)
     endpoint = free_endpoint()
     with (
         ServerLink(listen=[endpoint], silence=600) as link,
@@ -288,7 +288,7 @@ def test_answers_of_no_job_and_second_answers_are_refused_one_by_one(stage: Hand
 
 def test_large_batches_are_decoded_beside_the_caller(stage: Hand, monkeypatch: pytest.MonkeyPatch) -> None:
     """All count as large here. Meanwhile nothing is taken and second answers are refused; then each counts alone."""
-    monkeypatch.setattr(dispatch, "LARGE", 0)
+    monkeypatch.setattr(factor_intake, "LARGE", 0)
     batch, go = stage.batch(), threading.Event()
     decode, before = stage.driver.link.dispatch.decoder.decode_one, stage.driver.link.counters.refusals["duplicate"]
 
@@ -316,8 +316,8 @@ def test_what_waits_behind_a_first_job_has_longer(stage: Hand) -> None:
     stage.driver.submit(new, 1)
     batch = stage.batch()
     leases = {job.object: job.deadline - job.sent_at for job in stage.driver.link.dispatch.leases.jobs}
-    assert {name: round(leases[name]) for name in NAMES} == dict.fromkeys(NAMES, round(dispatch.BEHIND))
-    assert leases["new"] > 2 * dispatch.BEHIND, "but not as long: a message may be lost"
+    assert {name: round(leases[name]) for name in NAMES} == dict.fromkeys(NAMES, round(job_sender.BEHIND))
+    assert leases["new"] > 2 * job_sender.BEHIND, "but not as long: a message may be lost"
     answer, values = stage.hand.right_answer(stage.hand.receive(), new)
     stage.hand.answer(answer, values)
     stage.send(stage.answer(batch))
@@ -360,7 +360,7 @@ def test_a_worker_of_an_older_version_gets_them_one_by_one(stage: Hand) -> None:
 
 def test_a_real_worker_answers_batches(monkeypatch: pytest.MonkeyPatch) -> None:
     """Twelve objects of three sizes, forty rounds: each factor is that of its own matrix."""
-    monkeypatch.setattr(dispatch, "QUEUE_SECONDS", 60.0)
+    monkeypatch.setattr(worker_choice, "QUEUE_SECONDS", 60.0)
     endpoint, names = free_endpoint(), [f"beam{k}" for k in range(12)]
     beams = [chain(5 + k % 3, name) for k, name in enumerate(names)]
     with ServerLink(listen=[endpoint]) as link, light_worker(endpoint):

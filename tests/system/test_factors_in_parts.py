@@ -18,7 +18,7 @@ from protocol.messages_pb2 import Factor, FactorPart, Header, Matrix
 from protocol.network.factor_parts import bytes_of, part, part_checksums
 from protocol.network.session import open_session
 from protocol.shared_memory import limits as shm_limits
-from sim_server.network import dispatch, factor_fetch
+from sim_server.network import factor_fetch, job_sender
 from sim_server.network.factor_fetch import FactorFetch
 from sim_server.network.link import ServerLink
 
@@ -32,8 +32,8 @@ PART = 64  # bytes
 
 @pytest.fixture(autouse=True)
 def small_parts(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(dispatch, "PART_BYTES", PART)
-    monkeypatch.setattr(dispatch, "SLOT_SHARE", 1 << 40)  # no slot is lent for a whole factor
+    monkeypatch.setattr(job_sender, "PART_BYTES", PART)
+    monkeypatch.setattr(job_sender, "SLOT_SHARE", 1 << 40)  # no slot is lent for a whole factor
 
 
 class Gate:
@@ -77,7 +77,7 @@ def test_ordinary_factors_travel_in_many_parts(way: str) -> None:
 
 def test_what_is_not_large_travels_as_before(monkeypatch: pytest.MonkeyPatch) -> None:
     """No question is asked for a factor of at most four parts, and none of a worker that sends it whole."""
-    monkeypatch.setattr(dispatch, "PART_BYTES", 300)  # of 1200
+    monkeypatch.setattr(job_sender, "PART_BYTES", 300)  # of 1200
     monkeypatch.setattr(FactorFetch, "__init__", lambda *_: pytest.fail("a part was asked for"))
     endpoint = free_endpoint()
     with ServerLink(listen=[endpoint]) as link, light_worker(endpoint, "light", "no-shm"):
