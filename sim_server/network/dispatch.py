@@ -58,7 +58,7 @@ class Dispatch(FactorSource):
         silence: float,
         clock: Callable[[], float],
     ):
-        self._counters, self._shared, self._clock = counters, pool is not None, clock
+        self._counters, self._pool, self._shared, self._clock = counters, pool, pool is not None, clock
         self.decoder, self.leases, self.reliability = FactorDecoder(incarnation), Leases(pool), WorkerReliability()
         self._registry = WorkerRegistry(incarnation, silence)
         self._book = Bookkeeping(
@@ -89,6 +89,8 @@ class Dispatch(FactorSource):
         """Begins a new epoch of an object; answers to jobs of the last one are refused."""
         with self._lock:
             self._book.announce(topology)
+            if self._pool is not None:
+                self._pool.prepare(72 * len(topology.columns) // 4)  # of the matrix, 3x3 numbers of 8 bytes a block
 
     def epoch(self, name: str) -> int | None:
         """Returns the epoch of an object that was announced last; jobs of others are refused."""

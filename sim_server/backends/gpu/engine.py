@@ -29,6 +29,7 @@ from sim_server.backends.gpu.energies import DeviceEnergies
 from sim_server.backends.gpu.factor_upload import FactorUpload
 from sim_server.backends.gpu.held import HeldForces, leading
 from sim_server.backends.gpu.kernel_fusion import DOMAINS, Epilogue, FusedKernel, Prologue, fuse
+from sim_server.backends.gpu.known_patterns import KnownPatterns
 from sim_server.backends.gpu.loop import CAPACITY, MANY, DeviceLoop
 from sim_server.backends.gpu.mailbox import ChangeMailbox, DeviceMailbox
 from sim_server.backends.gpu.measured import MeasuredReport
@@ -204,6 +205,8 @@ class GpuEngine(DeviceLoop):
             self.report_pairs(*told)
         if measured is not None:
             self.report_measured(given.measured, measured)
+        kept = () if most_blocks else ranges  # patterns of what is split change
+        self._patterns = KnownPatterns(self.solver, kept, arrays["row_start"], arrays["columns"])
         self._factor_upload = FactorUpload(gpu, self.solver, self, given.names, self.mailboxes[bodies : 2 * bodies])
         for k in range(bodies):
             whole = self.solver.bodies[k : k + 1].tobytes()
@@ -472,8 +475,10 @@ class GpuEngine(DeviceLoop):
         )
 
     def prepare_for_factors(self) -> None:
-        """Has the kernels that build inverses of factors compiled beside the caller."""
+        """Has the kernels that build inverses of factors compiled beside the caller, and the inverses planned whose
+        patterns are known from earlier runs."""
         self.solver.compile_builder()
+        self._patterns.plan()
 
     def prepare_factor(self, body: int, factor: Factor, r: Float64) -> Callable[[], Float64 | None]:
         """Builds the inverse of a factor beside caller and steps, and applies it to r; returns what waits for that."""
@@ -499,6 +504,7 @@ class GpuEngine(DeviceLoop):
     def expect_factors(self, body: int, pattern: FactorPattern) -> None:
         """Begins to plan the inverses of factors of a pattern that will come, beside the caller."""
         self._factor_upload.expect(body, pattern)
+        self._patterns.note(body, pattern)
 
     def resume_factor(self, body: int, pattern: FactorPattern, values: NDArray[Any], step: int) -> None:
         """Posts the factor that was in use when the state was saved."""

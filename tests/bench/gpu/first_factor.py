@@ -8,7 +8,6 @@ earlier run has put them there. A short time step tells more closely after what 
 
 import argparse
 import json
-import socket
 import subprocess
 import sys
 import tempfile
@@ -23,6 +22,7 @@ from clients.client import Client
 from clients.errors import ClientError
 from protocol import messages_pb2 as pb
 from tests.bench.gpu.problem import Problem
+from tests.ports import free_endpoint
 
 PATIENCE = 90.0  # s
 
@@ -38,11 +38,8 @@ def measure(
     how many failed, and the longest [ms]; of the factors in the last half their number a second, mean age [steps] and
     time from the step of the matrix to the first step that uses it [ms]; times of the steps in that half [ms]
     """
-    with tempfile.TemporaryDirectory() as folder, socket.socket() as probe:
-        scene = Problem(tets, dt=dt).write(Path(folder))
-        probe.bind(("127.0.0.1", 0))
-        endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
-        probe.close()
+    with tempfile.TemporaryDirectory() as folder:
+        scene, endpoint = Problem(tets, dt=dt).write(Path(folder)), free_endpoint()
         server = subprocess.Popen(
             [sys.executable, "-m", "sim_server", str(scene), "--device", device, "--realtime", "--workers", "1",
              "--worker-device", worker, "--listen", endpoint, "--set", f"solver.first_factor={first}"],
