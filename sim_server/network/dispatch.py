@@ -29,7 +29,7 @@ from sim_server.network.worker_choice import WorkerChoice
 from sim_server.network.worker_registry import WorkerRegistry
 from sim_server.network.worker_reliability import WorkerReliability
 from sim_server.network.worker_timing import WorkerTiming
-from sim_server.updates.factor_source import FactorSource, Job
+from sim_server.updates.factor_source import FactorMemory, FactorSource, Job
 
 log = logging.getLogger(__name__)
 
@@ -58,7 +58,7 @@ class Dispatch(FactorSource):
         silence: float,
         clock: Callable[[], float],
     ):
-        self._counters, self._shared, self._clock = counters, pool is not None, clock
+        self._counters, self._pool, self._shared, self._clock = counters, pool, pool is not None, clock
         self.decoder, self.leases, self.reliability = FactorDecoder(incarnation), Leases(pool), WorkerReliability()
         self._registry = WorkerRegistry(incarnation, silence)
         self._book = Bookkeeping(
@@ -89,6 +89,8 @@ class Dispatch(FactorSource):
         """Begins a new epoch of an object; answers to jobs of the last one are refused."""
         with self._lock:
             self._book.announce(topology)
+            if self._pool is not None:
+                self._pool.prepare(72 * len(topology.columns) // 4)  # of the matrix, 3x3 numbers of 8 bytes a block
 
     def epoch(self, name: str) -> int | None:
         """Returns the epoch of an object that was announced last; jobs of others are refused."""
@@ -148,6 +150,10 @@ class Dispatch(FactorSource):
         with self._lock:
             failures, self._book.failures = self._book.failures, []
             return failures
+
+    def use_memory(self, memory: FactorMemory) -> None:
+        """Has large factors that arrive put into arrays that `memory` makes."""
+        self.decoder.memory = memory
 
     def worker_count(self) -> int:
         """Number of workers that may be given jobs, idle or busy."""

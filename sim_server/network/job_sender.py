@@ -171,7 +171,8 @@ class JobSender:
         return False
 
     def _allocate(self, worker: str, job: Job) -> tuple[Slot | None, Slot | None]:
-        """Allocates slots for the matrix and its factor; None for an array that must travel as bytes."""
+        """Allocates slots for the matrix and its factor; None for an array that must travel as bytes, as the first
+        large one does while its slot is being made: the caller would wait for that as long as many rounds take."""
         if self._pool is None or not self._choice.has_slots(worker):
             return None, None
         nonzeros = self._book.decoder.objects[job.object].largest.get(job.method.name, 0)
@@ -180,10 +181,11 @@ class JobSender:
         size = nonzeros * np.dtype(job.dtype).itemsize
         if size > max(WHOLE_PARTS * PART_BYTES, self._pool.limit // SLOT_SHARE):
             size = 0  # it comes in parts
-        matrix = self._pool.lend(job.values.nbytes)
-        factor = self._pool.lend(size) if size else None
-        if matrix is None or (size and factor is None):
+        pool, sizes = self._pool, [job.values.nbytes, *([size] if size else [])]
+        slots = [pool.lend(each, beside=True) for each in sizes]
+        if any(slot is None and not pool.is_making(each) for slot, each in zip(slots, sizes, strict=True)):
             self._counters.trouble("slots_exhausted", "no slot of shared memory is left, an array travels as bytes")
+        matrix, factor = [*slots, None][:2]
         return matrix, factor
 
     # ---- both ------------------------------------------------------------------------------------------------

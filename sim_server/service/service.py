@@ -85,7 +85,9 @@ class Service:
         self._set_intervals()
         self._batches: deque[tuple[NDArray[Any], ...]] = deque()  # records and what comes with them
         self._failure: BaseException | None = None
-        self._status_requests = StatusRequests(lambda: self.telemetry.publish_status(self._state(), where=True))
+        self._status_requests = StatusRequests(
+            lambda where: self.telemetry.publish_status(self._state(), where=where), self.telemetry.fetch_places
+        )
         self._halts = Halts(self.commands)
         self._between = BetweenSteps(self.engine.loop)
         self._start = Start(simulation)

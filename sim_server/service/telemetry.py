@@ -3,6 +3,7 @@
 
 import os
 import time
+from concurrent.futures import Future
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -88,6 +89,7 @@ class Telemetry:
         self._due = {"steps": 0.0, "state": 0.0, "status": 0.0, "look": 0.0}
         self._has_viewers = False
         self._points: list[NamedPoints] = []
+        self._positions: Future[Float64] | None = None  # for the next status with places
         self._stale_moduli: set[str] = set()  # keys of parameters that were set
         self.simulation.parameters.on_set.append(self._on_set)
         self.metrics: ServerMetrics | None = None
@@ -277,6 +279,7 @@ class Telemetry:
         status.obstacles.extend(pose_messages(self.simulation, status.step, fixed=True))
         if where:
             messages.add_places(self._places(), status)
+        self._positions = None  # those that come later would be old in the next status
         self.link.publish_status(status)
         if self.metrics is not None:
             self.metrics.status = status
@@ -320,11 +323,19 @@ class Telemetry:
             events=self.summary.events.of(body.index),
         )
 
+    def fetch_places(self) -> bool:
+        """Begins to fetch the positions of all nodes for the next status; True once they are there."""
+        if self._positions is None:
+            self._positions = self.simulation.world.backend.begin_fetch(self.simulation.world.x)
+        return self._positions.done()
+
     def _places(self) -> list[NamedPoints]:
-        """Returns the named points of all objects at their present positions."""
+        """Returns the named points of all objects at the positions that were fetched, else the present ones."""
         world = self.simulation.world
         self._points = self._points or [NamedPoints(world, body) for body in world.bodies]
-        x = world.backend.fetch(world.x)
+        self.fetch_places()
+        assert self._positions is not None
+        x = self._positions.result()
         for points in self._points:
             points.now(x)
         return self._points

@@ -1,25 +1,37 @@
 # SPDX-License-Identifier: MIT
 """How often a server makes a status because clients ask for one."""
 
+import itertools
+
 import pytest
 
 from protocol import messages_pb2 as pb
-from sim_server.service.status_requests import INTERVAL, REST, StatusRequests
+from sim_server.service.status_requests import INTERVAL, LATE, REST, StatusRequests
 
 
 class Asked:
     """Requests for statuses, with a clock of their own.
 
-    seconds: that a status takes. made: when statuses were made [s]
+    seconds: that a status takes. fetch: that places of objects take. made: when statuses were made [s]; of the same,
+    whether with places
     """
 
-    def __init__(self, seconds: float):
-        self.now, self.seconds, self.answers = 0.0, seconds, 0
+    def __init__(self, seconds: float, fetch: float = 0.0):
+        self.now, self.seconds, self.fetch, self.answers = 0.0, seconds, fetch, 0
         self.made: list[float] = []
-        self._requests = StatusRequests(self._make, lambda: self.now)
+        self.with_places: list[bool] = []
+        self._fetched = -1.0  # when the places are there; below 0: nobody fetches them
+        self._requests = StatusRequests(self._make, self._ready, lambda: self.now)
 
-    def _make(self) -> None:
+    def _ready(self) -> bool:
+        self._fetched = self.now + self.fetch if self._fetched < 0 else self._fetched
+        return self.now >= self._fetched
+
+    def _make(self, where: bool) -> None:
         self.made.append(self.now)
+        self.with_places.append(where)
+        if where:
+            self._fetched = -1.0
         self.now += self.seconds
 
     def _answer(self, reply: pb.Reply) -> None:
@@ -64,3 +76,23 @@ def test_nobody_asks_and_none_is_made() -> None:
     for _ in range(10):
         asked.round(requests=0)
     assert asked.made == []
+
+
+def test_a_status_has_the_places_that_come_soon() -> None:
+    asked = Asked(1e-4, fetch=3e-3)
+    for _ in range(20):
+        asked.round(requests=1)
+    assert all(asked.with_places) and len(asked.made) > 3
+
+
+def test_while_a_device_is_busy_a_status_comes_without_places_and_later_with_them() -> None:
+    """As while another thread allocates memory that a GPU reads."""
+    asked = Asked(1e-4, fetch=0.1)
+    asked.round(requests=1)
+    while not asked.made:
+        asked.round(requests=0)
+    assert asked.with_places == [False] and asked.made[0] <= LATE + 2e-3 and asked.answers == 1
+    for _ in range(100):
+        asked.round(requests=1)
+    gaps = [later - sooner for sooner, later in itertools.pairwise(asked.made)]
+    assert True in asked.with_places and max(gaps) <= LATE + INTERVAL + 2e-3
