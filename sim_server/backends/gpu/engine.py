@@ -101,8 +101,9 @@ class GpuEngine(DeviceLoop):
             substep_forces, assemble = assemble, []
         ranges, arrays, dt, newton = given.ranges, given.arrays, given.dt, given.newton
         stages, precision = given.stages, given.solver.factor_precision
-        fine = precision == "float32" or (precision == "auto" and stages is not None and stages.factor_alone)
-        planes = 2 if fine else 1  # float16 numbers per entry of an inverse
+        if precision == "auto" and stages is not None and stages.factor_alone:
+            precision = "float32"
+        planes = {"float16": 1, "float32": 2}.get(precision)  # float16 numbers per entry of an inverse
         budgets = bool(given.solver.budget or given.solver.step_budget)
         errors = given.errors or budgets
         self.gpu, self._arrays = gpu, arrays
