@@ -54,7 +54,7 @@ class Maker:
         if isinstance(self.fail, ValueError):
             made.set_exception(self.fail)
         elif self.planning is None:
-            made.set_result(SimpleNamespace(builder=self))
+            made.set_result(SimpleNamespace(builder=self, plan=None))
         else:
             self.planning.append(made)
         return made
@@ -67,13 +67,21 @@ class Maker:
         return self.storages[-1]
 
     spared = None
+    most = 3  # inverses that are built together
 
-    def build(self, values: np.ndarray, storage: list[int], multiprocessors: int | None = None) -> PartitionedInverse:
+    def build_many(
+        self, values: list[np.ndarray], storages: list[list[int]], multiprocessors: int | None
+    ) -> list[PartitionedInverse]:
         if self.fail:
             raise self.fail
-        storage[:] = [int(values[0])]
+        assert 0 < len(values) == len(storages) <= self.most
         self.events.append(Event(self.scene))
-        return PartitionedInverse(storage, self.events[-1])
+        for each, storage in zip(values, storages, strict=True):
+            storage[:] = [int(each[0])]
+        return [PartitionedInverse(storage, self.events[-1]) for storage in storages]
+
+    def reserve_vectors(self, body: int, plan: Any) -> None:
+        return
 
     def forget_plans(self, patterns: set[int]) -> None:
         self.known = patterns
@@ -176,7 +184,7 @@ def test_nobody_waits_for_a_plan_and_the_newest_factor_wins(parts):
     scene.loop.run(1)  # goes without
     assert len(plans) == 1 and maker.storages == [] and upload.step(0) == -1
     maker.planning = None
-    plans[0].set_result(SimpleNamespace(builder=maker))
+    plans[0].set_result(SimpleNamespace(builder=maker, plan=None))
     upload.settle()  # the first one is withdrawn, since another waits
     scene.loop.run(1)
     assert used(scene) == [0, 7] and upload.step(0) == 7
@@ -201,14 +209,14 @@ def test_large_factors_are_built_beside_the_caller(parts, monkeypatch):
     scene, maker, upload = parts
     monkeypatch.setattr(module, "SMALL", 0)
     begun, callers = threading.Event(), []
-    build = maker.build
+    build = maker.build_many
 
-    def slow(*arguments: Any) -> PartitionedInverse:
+    def slow(*arguments: Any) -> list[PartitionedInverse]:
         callers.append(threading.current_thread())
         begun.wait(30)
         return build(*arguments)
 
-    maker.build = slow
+    maker.build_many = slow
     post(upload, 5)
     post(upload, 6)
     assert upload.step(0) == -1 and maker.storages in ([], [[]])  # it is under way
@@ -285,20 +293,21 @@ class Mailbox:
 
     taken, posted = False, 0
 
-    def post(self, data: bytes, keep: Any = None, event: int | None = None) -> None:
+    def post(self, data: bytes, keep: Any = None, event: int | None = None) -> SimpleNamespace:
         self.taken, self.posted = False, keep.step
+        return SimpleNamespace(taken=0)
 
 
 def test_many_are_built_beside_the_caller(many):
     """Who posts them waits for no build; each goes into the mailbox of its body once it is looked at again."""
     maker, upload, boxes = many
-    go, build = threading.Event(), maker.build
+    go, build = threading.Event(), maker.build_many
 
-    def slow(*arguments: Any) -> PartitionedInverse:
+    def slow(*arguments: Any) -> list[PartitionedInverse]:
         assert go.wait(30)
         return build(*arguments)
 
-    maker.build = slow
+    maker.build_many = slow
     values = list(range(1, len(boxes) + 1))
     post_all(upload, values)
     upload.advance()
@@ -325,14 +334,15 @@ def test_few_are_built_at_once(many):
 
 def test_one_of_many_that_cannot_be_used_is_told_alone(many, caplog):
     maker, upload, boxes = many
-    build = maker.build
+    storage = maker.storage
 
-    def spoiled(values: np.ndarray, *arguments: Any) -> PartitionedInverse:
-        if values[0] == 2:
+    def spoiled() -> list[int]:
+        if len(maker.storages) == 1 and maker.most == 3:
+            maker.most = 2
             raise NoMemory("full")
-        return build(values, *arguments)
+        return storage()
 
-    maker.build = spoiled
+    maker.storage = spoiled
     with caplog.at_level(logging.WARNING):
         post_all(upload, list(range(1, len(boxes) + 1)))
         maker.thread.submit(lambda: None).result()

@@ -4,12 +4,12 @@
 Each body has two storages per pattern (double buffering). A build begins once the inverse before it is in use and no
 step under way reads the other storage. A factor that arrives earlier is queued; a newer one replaces it. Plans, made
 once per pattern, and the copies of large factors, or of many, are left to a thread (PcgSolver.beside), for which the
-thread that serves the loop does not wait.
+thread that serves the loop does not wait. Many small ones of one plan are built together.
 """
 
 import logging
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import Future, wait
 from dataclasses import dataclass, field
 from functools import partial
@@ -24,11 +24,13 @@ from sim_server.backends.gpu.inverse.build_inverse import InverseStorage, Partit
 from sim_server.backends.gpu.loop import DeviceLoop
 from sim_server.backends.gpu.mailbox import DeviceMailbox
 from sim_server.backends.gpu.solver import SETTINGS_BYTES, PcgSolver, PlannedInverse
+from sim_server.backends.gpu.structs import Mail
 
 log = logging.getLogger(__name__)
 
 SMALL = 1 << 20  # bytes of a factor that is copied at once
 MANY = 4  # small factors that come together, from which on none is built at once
+TOGETHER = 64  # factors of one plan that are handed over together
 MAX_PATTERNS = 2  # of a body at a time; workers with different libraries send different patterns
 
 
@@ -49,14 +51,25 @@ class GivenFactor(NamedTuple):
     step: int
 
 
+class Builds(NamedTuple):
+    """Inverses of factors of one plan that are built beside the caller.
+
+    given: by body
+    made: of each, in this order, or why there is none
+    """
+
+    given: dict[int, GivenFactor]
+    made: Future[list[UploadedFactor | Exception]]
+
+
 @dataclass
 class BodyUploads:
     """Factors of one body.
 
     storages: by id of the pattern
     leaving: the factor in use before, and the number of steps after whose completion no step reads it
-    posted: not taken by the loop yet
-    building: in the thread of the plans, and the factor that it is of
+    posted: not taken by the loop yet, in this mail
+    building: in the thread of the plans, with others
     queued: a factor that waits for a storage, or for that thread
     warned: True after the first factor that could not be used
     """
@@ -67,7 +80,8 @@ class BodyUploads:
     in_use: UploadedFactor | None = None
     leaving: tuple[UploadedFactor, int] | None = None
     posted: UploadedFactor | None = None
-    building: tuple[Future[UploadedFactor], GivenFactor] | None = None
+    mail: Mail | None = None
+    building: Builds | None = None
     queued: GivenFactor | None = None
     warned: bool = False
 
@@ -76,10 +90,9 @@ class BodyUploads:
         """True if a build may begin: a storage is free, or will be made."""
         return self.posted is None and self.leaving is None and self.building is None
 
-    @property
-    def patterns(self) -> set[int]:
-        """Ids of the patterns whose plans are needed."""
-        coming = [given for given in (self.queued, self.building and self.building[1]) if given]
+    def patterns(self, body: int) -> set[int]:
+        """Ids of the patterns whose plans are needed. body: number of this one"""
+        coming = [given for given in (self.queued, self.building and self.building.given[body]) if given]
         return {*self.storages, *(given.pattern.id for given in coming)}
 
 
@@ -97,7 +110,9 @@ class FactorUpload:
         self._gpu, self._solver, self._loop = gpu, solver, loop
         self._uploads = [BodyUploads(name, box) for name, box in zip(names, mailboxes, strict=True)]
         self._lock = threading.RLock()
-        self._waiting: set[int] = set()  # bodies with a queued factor, or one that is built
+        self._waiting: set[int] = set()  # bodies with a queued factor
+        self._builds: list[Builds] = []  # under way beside the caller
+        self._known: set[int] = set()  # ids of patterns that storages were made for
 
     def expect(self, body: int, pattern: FactorPattern) -> None:
         """Begins to plan the inverses of factors of a pattern, beside the caller."""
@@ -109,28 +124,27 @@ class FactorUpload:
         Returns at once: what takes long, plans and large factors, is done beside the caller. The values must not change
         any more.
         """
-        with self._lock:
-            uploads = self._uploads[body]
-            self._refresh(body)
-            uploads.queued = GivenFactor(pattern, values, step)
-            self._begin_queued(body)
+        self.post_many([(body, pattern, values, step)])
 
     def post_many(self, given: Sequence[tuple[int, FactorPattern, NDArray[Any], int]]) -> None:
         """Takes factors of different bodies, each as `post` takes one. Inverses of many are built beside the caller,
-        who would wait for one after another."""
+        who would wait for one after another, those of one plan together."""
         with self._lock:
             for body, pattern, values, step in given:
                 self._refresh(body)
                 self._uploads[body].queued = GivenFactor(pattern, values, step)
-                self._begin_queued(body, len(given) >= MANY)
+            self._begin_queued([body for body, *_ in given])
 
     def advance(self) -> None:
         """Posts what was built beside the caller, and begins the builds that have waited for a storage."""
         with self._lock:
-            waiting = sorted(self._waiting)
-            for body in waiting:
-                self._refresh(body)
-                self._begin_queued(body, len(waiting) >= MANY)
+            for builds in [each for each in self._builds if each.made.done()]:
+                self._finish(builds)
+            if self._waiting:
+                waiting = sorted(self._waiting)
+                for body in waiting:
+                    self._refresh(body)
+                self._begin_queued(waiting)
 
     def settle(self) -> None:
         """Waits until the next step will use the newest factors. Only while the loop stands still."""
@@ -138,7 +152,7 @@ class FactorUpload:
             while (building := self._settled(body)) is not None:
                 wait([building])  # without the lock: the thread that serves the loop goes on
 
-    def _settled(self, body: int) -> "Future[UploadedFactor] | None":
+    def _settled(self, body: int) -> "Future[list[UploadedFactor | Exception]] | None":
         """Has the next step use the newest factor of a body; returns a build that must be waited for first."""
         with self._lock:
             uploads = self._uploads[body]
@@ -146,12 +160,12 @@ class FactorUpload:
             if uploads.queued is not None and uploads.building is None:
                 if uploads.posted is not None and uploads.mailbox.withdraw():
                     uploads.posted.inverse.event.synchronize()  # its storage may be reused
-                    uploads.posted = None
+                    uploads.posted = uploads.mail = None
                 self._refresh(body)
                 uploads.leaving = None
-                self._begin_queued(body)
+                self._begin_queued([body])
             if uploads.building is not None:
-                return uploads.building[0]
+                return uploads.building.made
             if uploads.posted is not None:
                 uploads.posted.inverse.event.synchronize()
             return None
@@ -166,56 +180,120 @@ class FactorUpload:
     def _refresh(self, body: int) -> None:
         """Updates the state of the factors: built, taken by the loop, out of use."""
         uploads = self._uploads[body]
-        if uploads.building is not None and uploads.building[0].done():
-            (future, given), uploads.building = uploads.building, None
-            self._finish(body, given.pattern, future.result)
-        if uploads.posted is not None and uploads.mailbox.taken:
-            if uploads.in_use is not None:  # steps launched until now may still read it
-                uploads.leaving = (uploads.in_use, int(self._loop.loop.launched))
-            uploads.in_use, uploads.posted = uploads.posted, None
+        if uploads.building is not None and uploads.building.made.done():
+            self._finish(uploads.building)
+        if uploads.posted is not None and uploads.mail is not None and uploads.mailbox.taken:
+            if uploads.in_use is not None:  # steps launched until then may still read it
+                uploads.leaving = (uploads.in_use, int(uploads.mail.taken))
+            uploads.in_use, uploads.posted, uploads.mail = uploads.posted, None, None
         if uploads.leaving is not None and self._loop.step >= uploads.leaving[1]:
             uploads.leaving = None
 
-    def _begin_queued(self, body: int, beside: bool = False) -> None:
-        """Begins to build the queued factor, if there is one and it need not wait. beside: not in this thread"""
-        uploads = self._uploads[body]
-        if uploads.queued is not None and uploads.free:
-            given, uploads.queued = uploads.queued, None
-            self._begin(body, given, beside)
-        if uploads.queued is None and uploads.building is None:
-            self._waiting.discard(body)
-        else:
-            self._waiting.add(body)
+    def _begin_queued(self, bodies: Sequence[int]) -> None:
+        """Begins to build the queued factors of some bodies that need not wait: at once if they are few, small and
+        planned, else in the thread of the plans."""
+        beside: dict[Future[PlannedInverse], list[int]] = {}
+        for body in bodies:
+            uploads = self._uploads[body]
+            if uploads.queued is not None and uploads.free:
+                plan = self._solver.begin_plan(body, uploads.queued.pattern)
+                small = uploads.queued.values.nbytes <= SMALL
+                if plan.done() and small and len(bodies) < MANY:
+                    given, uploads.queued = uploads.queued, None
+                    self._post(body, given.pattern, self._build(plan, [(body, given, self._spare(uploads, given))])[0])
+                else:
+                    beside.setdefault(plan, []).append(body)
+            if uploads.queued is None:
+                self._waiting.discard(body)
+            else:
+                self._waiting.add(body)
+        for plan, waiting in beside.items():
+            first = self._uploads[waiting[0]].queued
+            most = TOGETHER if first is not None and first.values.nbytes <= SMALL else 1
+            for k in range(0, len(waiting), most):
+                self._begin_beside(plan, waiting[k : k + most])
 
-    def _begin(self, body: int, given: GivenFactor, beside: bool) -> None:
-        """Builds an inverse: at once if it is small, planned and not `beside`, else in the thread of the plans."""
-        uploads = self._uploads[body]
-        plan = self._solver.begin_plan(body, given.pattern)
+    def _begin_beside(self, plan: Future[PlannedInverse], bodies: Sequence[int]) -> None:
+        work = []
+        for body in bodies:
+            uploads = self._uploads[body]
+            given, uploads.queued = uploads.queued, None
+            assert given is not None
+            work.append((body, given, self._spare(uploads, given)))
+            self._waiting.discard(body)
+        builds = Builds({body: given for body, given, _ in work}, self._solver.beside(partial(self._build, plan, work)))
+        for body in bodies:
+            self._uploads[body].building = builds
+        self._builds.append(builds)
+
+    def _spare(self, uploads: BodyUploads, given: GivenFactor) -> InverseStorage | None:
+        """Returns a storage that no step reads; None: one is to be made."""
         used = uploads.in_use.storage if uploads.in_use else None
-        spare = next((s for s in uploads.storages.get(given.pattern.id, []) if s is not used), None)
-        build = partial(self._build, plan, given, spare)
-        if plan.done() and given.values.nbytes <= SMALL and not beside:
-            self._finish(body, given.pattern, build)
-        else:
-            uploads.building = self._solver.beside(build), given
+        return next((s for s in uploads.storages.get(given.pattern.id, []) if s is not used), None)
 
     def _build(
-        self, plan: Future[PlannedInverse], given: GivenFactor, spare: InverseStorage | None
-    ) -> UploadedFactor:  # fmt: skip
-        """Begins to build an inverse in a storage, a new one unless there is one to spare. The plan is made."""
-        builder = plan.result().builder
-        storage = builder.storage() if spare is None else spare
+        self, plan: Future[PlannedInverse], work: Sequence[tuple[int, GivenFactor, InverseStorage | None]]
+    ) -> list[UploadedFactor | Exception]:  # fmt: skip
+        """Begins to build inverses of factors of one plan, which is made, each in a storage, a new one unless there is
+        one to spare."""
+        try:
+            planned = plan.result()
+        except Exception as error:
+            return [error for _ in work]
+        made: list[UploadedFactor | Exception | None] = [None] * len(work)
+        storages: dict[int, InverseStorage] = {}  # by place
+        for place, (body, _, spare) in enumerate(work):
+            try:
+                storages[place] = planned.builder.storage() if spare is None else spare
+                self._solver.reserve_vectors(body, planned.plan)
+            except Exception as error:
+                storages.pop(place, None)
+                made[place] = error
         self._gpu.cp.cuda.get_current_stream().synchronize()  # new arrays are complete for other streams
-        inverse = builder.build(given.values, storage, self._solver.spared)  # beside the steps
-        return UploadedFactor(inverse, storage, given.step, given.pattern)
+        places, most = list(storages), planned.builder.most
+        for k in range(0, len(places), most):
+            self._build_some(planned, work, {p: storages[p] for p in places[k : k + most]}, made)
+        return [each for each in made if each is not None]
 
-    def _finish(self, body: int, pattern: FactorPattern, build: Callable[[], UploadedFactor]) -> None:
-        """Posts the factor that `build` returns, or warns if it cannot be used."""
+    def _build_some(
+        self, planned: PlannedInverse, work: Sequence[tuple[int, GivenFactor, Any]],
+        storages: dict[int, InverseStorage], made: list[UploadedFactor | Exception | None],
+    ) -> None:  # fmt: skip
+        """Fills in what is made at some places, beside the steps."""
+        given = [work[place][1] for place in storages]
+        try:
+            inverses = planned.builder.build_many(
+                [each.values for each in given], list(storages.values()), self._solver.spared
+            )
+        except Exception as error:
+            for place in storages:
+                made[place] = error
+            return
+        for (place, storage), each, inverse in zip(storages.items(), given, inverses, strict=True):
+            made[place] = UploadedFactor(inverse, storage, each.step, each.pattern)
+
+    def _finish(self, builds: Builds) -> None:
+        """Posts what was built beside the caller."""
+        self._builds.remove(builds)
+        for body in builds.given:
+            self._uploads[body].building = None
+        errors = []
+        for (body, given), made in zip(builds.given.items(), builds.made.result(), strict=True):
+            try:
+                self._post(body, given.pattern, made)
+            except Exception as error:  # the others are posted all the same
+                errors.append(error)
+        if errors:
+            raise errors[0]
+
+    def _post(self, body: int, pattern: FactorPattern, made: UploadedFactor | Exception) -> None:
+        """Posts a factor, or warns if it cannot be used. Raises what is neither of the factor nor lack of memory."""
         uploads = self._uploads[body]
         try:
-            factor = build()
-            self._keep(uploads, factor)
-            self._solver.use(body, pattern, factor.inverse, factor.step)
+            if isinstance(made, Exception):
+                raise made
+            self._keep(uploads, made)
+            self._solver.use(body, pattern, made.inverse, made.step)
         except (ValueError, CompileError) as error:
             self._warn(uploads, str(error))
             return
@@ -224,23 +302,28 @@ class FactorUpload:
                 raise
             self._warn(uploads, f"not enough GPU memory: {error}")
             return
-        uploads.posted = factor
+        uploads.posted = made
         row = self._solver.bodies[body : body + 1].tobytes()[SETTINGS_BYTES:]
-        self._gpu.cp.cuda.get_current_stream().synchronize()  # arrays that `use` may have made are complete
-        uploads.mailbox.post(row, keep=factor, event=factor.inverse.event.ptr)
+        uploads.mail = uploads.mailbox.post(row, keep=made, event=made.inverse.event.ptr)
 
     def _keep(self, uploads: BodyUploads, factor: UploadedFactor) -> None:
         """Keeps the storage of a factor, and forgets those of patterns that are not used any more."""
         if factor.pattern.id not in uploads.storages:
             in_use = uploads.in_use.pattern.id if uploads.in_use else None
-            for old in [k for k in uploads.storages if k != in_use]:
+            outdated = [k for k in uploads.storages if k != in_use]
+            for old in outdated:
                 if len(uploads.storages) >= MAX_PATTERNS:
                     del uploads.storages[old]
-            kept = {each for other in self._uploads for each in other.patterns}
-            self._solver.forget_plans({*kept, factor.pattern.id})
+            if outdated or factor.pattern.id not in self._known:
+                self._forget_plans(factor.pattern.id)
         storages = uploads.storages.setdefault(factor.pattern.id, [])
         if all(storage is not factor.storage for storage in storages):
             storages.append(factor.storage)
+
+    def _forget_plans(self, needed: int) -> None:
+        """Forgets the plans of patterns that no body has. needed: id of one that is about to be used"""
+        self._known = {needed}.union(*(each.patterns(body) for body, each in enumerate(self._uploads)))
+        self._solver.forget_plans(self._known)
 
     def _warn(self, uploads: BodyUploads, reason: str) -> None:
         if not uploads.warned:
