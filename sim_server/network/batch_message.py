@@ -2,6 +2,7 @@
 """Several jobs in one message: their matrices one after another in one slot, and rooms for their factors in another."""
 
 from collections.abc import Sequence
+from itertools import chain
 from typing import NamedTuple
 
 import numpy as np
@@ -32,7 +33,7 @@ def entries_of(jobs: Sequence[tuple[Job, AnnouncedObject]]) -> list[Entry]:
     """Lays out the rooms of factors that are as large as the largest so far."""
     made, first = [], 0
     for job, known in jobs:
-        size = known.largest[job.method.name] * np.dtype(job.dtype).itemsize
+        size = known.most_values(job.method.name) * np.dtype(job.dtype).itemsize
         room = -(-size // ALIGNMENT) * ALIGNMENT
         made.append(Entry(job, known, room, first))
         first += room
@@ -49,7 +50,7 @@ def batch_message(
     """
     first, method = entries[0].job, entries[0].job.method
     values = matrix_slot.array(np.float64, sum(entry.job.values.size for entry in entries))
-    checksums, begin = [], 0
+    checksums, begin, known = [], 0, [entry.known.known_patterns for entry in entries]
     for entry in entries:
         part = values[begin : begin + entry.job.values.size]
         np.copyto(part.reshape(entry.job.values.shape), entry.job.values)
@@ -64,8 +65,7 @@ def batch_message(
         jobs=[job.number for job in in_flight], steps=[entry.job.step for entry in entries],
         warps=[entry.job.warp for entry in entries], blocks=[entry.known.blocks for entry in entries],
         checksums=checksums, rooms=[entry.room for entry in entries], leases=leases,
-        known=[len(entry.known.patterns) for entry in entries],
-        known_patterns=[id for entry in entries for id in entry.known.patterns],
+        known=map(len, known), known_patterns=chain(*known), topologies=[entry.known.topology for entry in entries],
     )  # fmt: skip
 
 

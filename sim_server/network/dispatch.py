@@ -6,7 +6,7 @@ import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from functools import partial
+from functools import cache, partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -186,6 +186,8 @@ class Dispatch(FactorSource):
         with self._lock:
             now = self._clock()
             idle = [(name, now - self._free_since.get(name, 0.0)) for name in self._open()]
+            if len(idle) == len(self._available()):
+                return 0
             full = {name for name in self.leases.by_worker if not self._room(name)}
             busy = [(j.worker, j.object, now - j.sent_at) for j in self.leases.jobs if j.worker in full]
             return self._timing.faster_busy_workers(idle, busy)
@@ -277,8 +279,8 @@ class Dispatch(FactorSource):
 
     def _fits_batch(self, job: Job) -> bool:
         """True if the size of the factor is known: that of an incomplete one may grow."""
-        known = self.decoder.objects[job.object].largest
-        return not job.positions and job.method.name in known and job.method.name != "incomplete_cholesky"
+        sized = self.decoder.objects[job.object].most_values(job.method.name) > 0
+        return not job.positions and sized and job.method.name != "incomplete_cholesky"
 
     def _takes_batches(self, worker: str) -> bool:
         """True if several jobs of a worker may share a message. It has room for several only where all objects are
@@ -371,7 +373,7 @@ class Dispatch(FactorSource):
             job.epoch,
             job.step,
             job.warp,
-            np.dtype(job.dtype).name,
+            _dtype_name(job.dtype),
             worker,
             deadline=now + max(lease, min(self.leases.deadlines().get(worker, 0.0) - now, BEHIND)),
             factor_slot=factor_slot,
@@ -452,7 +454,7 @@ class Dispatch(FactorSource):
         """Allocates slots for the matrix and its factor; None for an array that must travel as bytes."""
         if self._pool is None or not self._has_slots(worker):
             return None, None
-        nonzeros = self.decoder.objects[job.object].largest.get(job.method.name, 0)
+        nonzeros = self.decoder.objects[job.object].most_values(job.method.name)
         if job.method.name == "incomplete_cholesky":
             nonzeros += nonzeros // SLOT_MARGIN  # the next factor may keep more blocks
         size = nonzeros * np.dtype(job.dtype).itemsize
@@ -669,7 +671,8 @@ class Dispatch(FactorSource):
             job, fetch = self.decoding[number].job, self.decoding[number].fetch
             if fetch is not None and self.leases.by_object.get(job.object) is not job:
                 fetch.give_up()
-        for number in [number for number, each in self.decoding.items() if each.future.done()]:
+        done = {id(future) for future in {each.future for each in self.decoding.values()} if future.done()}
+        for number in [number for number, each in self.decoding.items() if id(each.future) in done]:
             each = self.decoding.pop(number)
             self._fetches.discard(number)
             job, fetch = each.job, each.fetch
@@ -742,6 +745,11 @@ class Dispatch(FactorSource):
 
     def _fail(self, job: InFlightJob, why: str) -> None:
         self._failures.append((job.object, f"factorization of {job.object} at step {job.step} {why}"))
+
+
+@cache
+def _dtype_name(dtype: str) -> str:
+    return np.dtype(dtype).name
 
 
 def _no_factor() -> Factor:

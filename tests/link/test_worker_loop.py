@@ -4,6 +4,7 @@
 import logging
 import re
 import sys
+from collections.abc import Callable
 from types import SimpleNamespace
 from typing import Any, ClassVar
 
@@ -165,12 +166,16 @@ class Together(Diagonal):
     most = 3
     sizes: ClassVar[list[int]] = []
 
-    def factorize_many(self, values: list[np.ndarray], dtype: Any) -> list[np.ndarray] | None:
+    def begin_many(self, values: list[np.ndarray], dtype: Any) -> Callable[[], list[np.ndarray] | None]:
         self.sizes.append(len(values))
-        try:
-            return [self.factorize(each, dtype) for each in values]
-        except ValueError:
-            return None
+
+        def end() -> list[np.ndarray] | None:
+            try:
+                return [self.factorize(each, dtype) for each in values]
+            except ValueError:
+                return None
+
+        return end
 
 
 @pytest.fixture
@@ -201,6 +206,9 @@ def test_one_without_a_factor_does_not_spoil_those_of_others(together: Worker, c
     for k, name in enumerate("abc"):
         connection.received.put(matrix(10 + k, name, scale=-4.0 if name == "b" else 4.0))
     together.step(0.0)
+    assert not connection.answers and together.waiting == 3, "they are under way"
+    together.step(0.0)
+    assert together.idle
     failures = {answer.header.object: bool(answer.failure) for answer, _ in connection.answers}
     assert failures == {"a": False, "b": True, "c": False} and Together.sizes == [3]
 
