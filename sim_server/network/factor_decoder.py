@@ -37,7 +37,9 @@ MAX_PATTERNS = 4  # kept per object: one for each library among its workers
 class CompleteFactors:
     """What objects whose matrices have one pattern share.
 
-    patterns: of their complete factors, by id; largest: values of the largest of these, 0: there was none; objects: names
+    patterns: of their complete factors, by id
+    largest: values of the largest of these; 0: there was none
+    objects: their names
     """
 
     patterns: dict[int, FactorPattern] = field(default_factory=dict)

@@ -23,7 +23,7 @@ from protocol.method import Method
 from protocol.network.factor_parts import bytes_of, part_checksums
 from protocol.refused import Refused
 from protocol.shared_memory.view import SlotMap
-from protocol.validate import check_header, checksum
+from protocol.validate import check_header, checksum, topology_checksum
 
 
 class Payload(bytes):
@@ -158,6 +158,18 @@ def test_a_matrix_is_answered_with_its_factor(worker: Worker, connection: FakeCo
     assert (answer.step, answer.job, answer.worker, answer.dtype, answer.failure) == (10, 1, "w", "float32", "")
     assert answer.checksum == checksum(data) and answer.nonzeros == 6
     assert connection.patterns == [("beam", 1)] and connection.library == "diagonal"
+
+
+def test_the_server_is_not_asked_for_a_topology_that_is_known(worker: Worker, connection: FakeConnection) -> None:
+    shape = topology_checksum(connection.topology("a", 1))
+    connection.asked.clear()
+    told = [matrix(k, name, topology=shape) for k, name in ((1, "a"), (2, "b"))]
+    other = matrix(3, "c", topology=shape, method="ssor", omega=1.0)
+    drain(worker, connection, *told, other, matrix(4, "d"), matrix(5, "e", topology=shape, blocks=3))
+    assert connection.asked == [("a", 1), ("c", 1), ("d", 1)], "another method, or another topology, may be"
+    failures = {answer.header.object: answer.failure for answer, _ in connection.answers}
+    assert [name for name, failure in failures.items() if failure] == ["e"]
+    assert "blocks is 3; allowed: 2" in failures["e"]
 
 
 class Together(Diagonal):
