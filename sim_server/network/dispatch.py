@@ -4,8 +4,10 @@
 import logging
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
 from functools import cache, partial
 from typing import Any, NamedTuple
 
@@ -21,7 +23,7 @@ from protocol.method import Method
 from protocol.refused import Refused
 from protocol.shared_memory.pool import Slot, SlotPool
 from protocol.validate import take
-from sim_server.network.batch_message import MOST_TOGETHER, Entry, batch_message, entries_of, group
+from sim_server.network.batch_message import MOST_TOGETHER, Entry, batch_message, entries_of, fill, group
 from sim_server.network.factor_decoder import AnnouncedObject, FactorDecoder
 from sim_server.network.factor_fetch import AHEAD, FactorFetch
 from sim_server.network.inbox import Inbox
@@ -48,6 +50,14 @@ LARGE = 4 << 20  # bytes of a factor whose copy and checks take more than a few 
 SLOT_SHARE = 4  # a larger part of all shared memory than a SLOT_SHARE-th is not lent for one factor: it goes in parts
 FETCHES = 2  # factors that arrive in parts at a time, each in memory of its own
 SLOT_MARGIN = 8  # the slot for an incomplete factor is larger than the largest factor so far by a SLOT_MARGIN-th
+
+
+@dataclass
+class Filling:
+    """Slots of a batch that the thread of the send queue fills and sends; `over` once it has."""
+
+    slots: tuple[Slot, Slot]
+    over: bool = False
 
 
 class Decoding(NamedTuple):
@@ -103,6 +113,7 @@ class Dispatch(FactorSource):
         self._thread = ThreadPoolExecutor(1, "large factors")
         self._fetching = ThreadPoolExecutor(FETCHES, "parts of factors")
         self.decoding: dict[int, Decoding] = {}  # by number of the job
+        self._filling: deque[Filling] = deque()  # oldest first
         self._fetches: set[int] = set()  # of these, the jobs whose factors come in parts
         self._factors: list[Factor] = []
         self._failures: list[tuple[str, str]] = []
@@ -176,6 +187,12 @@ class Dispatch(FactorSource):
         """Number of workers that may be given jobs, idle or busy."""
         return len(self.workers())
 
+    def queues_jobs(self) -> bool:
+        """True if there are workers and all of them have several jobs at a time."""
+        with self._lock:
+            available = self._available()
+            return bool(available) and all(self._most_waiting(name) > 1 for name in available)
+
     def assembles_matrices(self) -> bool:
         """True if there are workers and all of them can assemble matrices from positions."""
         infos = self.workers()
@@ -238,7 +255,8 @@ class Dispatch(FactorSource):
     def submit_many(self, jobs: Sequence[Job]) -> list[bool]:
         """Sends jobs of different objects, the most urgent first, those of small objects to one worker in one message.
 
-        False for those for which no worker has room, or whose object has a job in flight.
+        False for those for which no worker has room, or whose object has a job in flight. Matrices are read until their
+        jobs are over: what is sent of one that changes before is of a job that nobody waits for.
         """
         with self._lock:
             self._receive()
@@ -302,24 +320,38 @@ class Dispatch(FactorSource):
             for job, lease, entry in zip(jobs, leases, entries, strict=True)
         ]
         message = batch_message(entries, in_flight, leases, self._incarnation, *slots)
-        name, attachment = key("matrices", self._server, worker=worker), message.SerializeToString()
-        payload = slots[0].payload
-        if self._queue.post(lambda: self._send(in_flight, name, payload, attachment, True)):
+        name, matrices, filling = (
+            key("matrices", self._server, worker=worker),
+            [job.values for job in jobs],
+            Filling(slots),
+        )
+
+        def send() -> None:
+            try:
+                fill(message, matrices, slots[0])
+                self._send(in_flight, name, slots[0].payload, message.SerializeToString(), True)
+            finally:
+                filling.over = True
+
+        if self._queue.post(send):
+            self._filling.append(filling)
             self._on_sent(worker, jobs)
             return [True] * len(jobs)
         for job in in_flight:
             self.leases.cancel(job)
+        self._give_back(slots)
         return [False] * len(jobs)
 
     def _allocate_batch(self, entries: Sequence[Entry]) -> tuple[Slot, Slot] | None:
         """Allocates a slot for matrices and one for factors; None if there is not enough shared memory."""
         assert self._pool is not None
-        matrices = self._pool.lend(sum(entry.job.values.nbytes for entry in entries), len(entries))
-        factors = self._pool.lend(entries[-1].first + entries[-1].room, len(entries))
+        users = len(entries) + 1  # and the thread that sends them
+        matrices = self._pool.lend(sum(entry.job.values.nbytes for entry in entries), users)
+        factors = self._pool.lend(entries[-1].first + entries[-1].room, users)
         if matrices is not None and factors is not None:
             return matrices, factors
         for slot in filter(None, (matrices, factors)):
-            for _ in entries:
+            for _ in range(users):
                 self._pool.give_back(slot)
         return None
 
@@ -404,13 +436,17 @@ class Dispatch(FactorSource):
         Several wait at a worker only where all objects are small and arrays are in shared memory, as many as it does
         within QUEUE_SECONDS: it then need not wait for the network after each, and may factorize them together.
         """
+        return max(0, self._most_waiting(worker) - self._waiting(worker))
+
+    def _most_waiting(self, worker: str) -> int:
+        """Number of jobs that may be in flight at a worker."""
         info, seconds = self._registry.info(worker), self._timing.mean_factorization(worker)
         most = 1
         small = self.decoder.most_blocks <= SMALL_BLOCKS and self._pool is not None
         if info is not None and info.shared_memory and seconds is not None and small:
             most = MOST_JOBS if info.batches and self.decoder.most_are_sized else MOST_ALONE
             most = max(1, min(info.most_jobs, most, int(QUEUE_SECONDS / max(seconds, 1e-6))))
-        return max(0, most - self._waiting(worker))
+        return most
 
     def _waiting(self, worker: str) -> int:
         """Number of jobs that a worker has not done yet; those whose parts are fetched are done."""
@@ -512,6 +548,8 @@ class Dispatch(FactorSource):
             except Refused as refusal:
                 self._counters.refuse(refusal)
         self._take_decoded()
+        while self._filling and self._filling[0].over:
+            self._give_back(self._filling.popleft().slots)
         self._query_tokens()
         now = self._clock()
         if now < self._looked_at + LOOK_PERIOD:

@@ -12,7 +12,7 @@ from protocol.method import Method
 from sim_server.backends.rosenbrock import FORMS
 from sim_server.mechanics.world import Body
 from sim_server.updates.autotune.preconditioner import PreconditionerTuner
-from sim_server.updates.stats import MEMORY, RunningMean, flops
+from sim_server.updates.stats import MEMORY, RunningMean, flops, updated
 from sim_server.updates.update_table import NONE, Cell, MeanCell, UpdateTable
 
 MAX_REMEMBERED = 32  # factors whose method and worker are remembered
@@ -68,7 +68,7 @@ class JobState:
     """The matrix that is being copied or factorized.
 
     copy: into which the loop copies the matrix or the positions requested
-    request: number of the request for that copy, among those of all bodies
+    request: number of the request for that copy, among those of all bodies; requested: when it was [s, monotonic]
     extrapolated: by how much the positions requested were extrapolated [s]
     sent: step of the last matrix that was sent; None: none was
     matrix: of the job in flight: step and what was sent
@@ -81,7 +81,7 @@ class JobState:
     def __init__(self, table: UpdateTable, index: int):
         self._table, self._index = table, index
         self._copy: NDArray[np.float64] | None = None
-        self.request, self.extrapolated, self.excess = 0, 0.0, 0.0
+        self.request, self.requested, self.extrapolated, self.excess = 0, 0.0, 0.0, 0.0
         self.matrix: tuple[int, NDArray[np.float64]] | None = None
         self.positions = False
 
@@ -173,11 +173,15 @@ class FactorStatistics:
     def add(self, factor: Factor, cost: float) -> None:
         """Adds a factor. cost: of its making."""
         self.cost.add(cost)
+        self.newest = factor.step
+        self.used += 1
+        self.note(factor, cost)
+
+    def note(self, factor: Factor, cost: float) -> None:
+        """Remembers of a factor what stands in no table."""
         if method := self.method(factor.step):
             self.cost_by_method.setdefault(method.name, RunningMean()).add(cost)
-        self.newest = factor.step
         _remember(self.workers, factor.step, factor.worker)
-        self.used += 1
         self.regularized += bool(factor.remedy)
 
 
@@ -313,6 +317,42 @@ def observe_steps(states: Sequence[BodyUpdateState], table: UpdateTable, r: NDAr
     outdated = one & (made >= 0) & (made < table.newest)  # a newer factor was taken up: these solves count no more
     for k in np.flatnonzero(~same & ~outdated).tolist():
         states[k].solves.add(above[:, k].tolist(), factor[:, k].tolist(), states[k].factors.newest)
+
+
+def on_factors(
+    states: Sequence[BodyUpdateState], table: UpdateTable, factors: Sequence[Factor], step: int
+) -> list[bool]:  # fmt: skip
+    """Takes note of factors of different bodies, as BodyUpdateState.on_factor does of each, with costs in seconds.
+
+    table: that of the states. step: during which they came
+    """
+    row = np.array([state.body.index for state in states])
+    made = np.array([factor.step for factor in factors])
+    came = table.in_flight[row] & (made == table.sent[row])
+    _add(table.latency, row[came], np.maximum(1, step - made[came]))
+    table.in_flight[row], table.failures[row] = False, 0
+    newer = made > table.newest[row]
+    taken = row[newer]
+    _add(table.cost, taken, np.maximum([factor.seconds for factor in factors], MIN_SECONDS)[newer])
+    table.newest[taken] = made[newer]
+    table.used[taken] += 1
+    table.lost[taken] = 0.0
+    table.excess[taken] = table.latest[taken] = [
+        state.solves.first_excess.value or 0.0 for state, better in zip(states, newer, strict=True) if better
+    ]
+    table.sent[taken] = np.where(table.sent[taken] == NONE, made[newer], table.sent[taken])
+    for state, factor, better in zip(states, factors, newer.tolist(), strict=True):
+        if state.job.positions:
+            state.failures.assemblies = 0
+        if better:
+            state.factors.note(factor, max(factor.seconds, MIN_SECONDS))
+    return list(newer.tolist())
+
+
+def _add(means: NDArray[np.float64], rows: NDArray[np.int64], values: NDArray[Any]) -> None:
+    """Adds a value to each of some running means, NaN where there was none."""
+    before = means[rows]
+    means[rows] = np.where(np.isnan(before), values, updated(before, values))
 
 
 def _remember(table: dict[int, Any], step: int, value: Any) -> None:
