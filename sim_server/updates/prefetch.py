@@ -13,6 +13,8 @@ from sim_server.updates.stats import RunningMean
 
 MAX_DEPTH = 256  # matrices held at once
 MAX_WAIT = 2  # steps that a copied matrix may wait for a worker, and those that a copy takes beyond one
+WINDOW = 0.05  # s over which matrices that are sent are counted
+MORE = 1.5  # copies that are begun over those that are sent meanwhile
 TRANSFER = 1e-3  # s of a job beside the factorization, about
 
 
@@ -27,6 +29,8 @@ class PrefetchDepth:
         self.depth, self.patience = 0, MAX_WAIT
         self._period = RunningMean()  # s from step to step
         self._copy = RunningMean()  # s from the request of a copy until it is there
+        self._rate = RunningMean()  # matrices that were sent in a second
+        self._sent, self._since = 0, 0.0
         self._last: tuple[int, float] | None = None
 
     def on_step(self, step: int, now: float) -> bool:
@@ -42,16 +46,26 @@ class PrefetchDepth:
         """Takes note of a copy that is there so many seconds after its request."""
         self._copy.add(seconds)
 
+    def on_sent(self, count: int, now: float) -> None:
+        """Takes note of matrices that were sent at the time `now` [s], or of none."""
+        self._sent += count
+        if (lasted := now - self._since) > WINDOW:
+            self._rate.add(self._sent / lasted)
+            self._sent, self._since = 0, now
+
     def update(self, seconds: Float64, workers: int, queued: bool = False) -> None:
         """Computes the depth.
 
         seconds: of a factorization of each body, NaN: not known yet
-        queued: several jobs wait at each worker, for which their transfer then takes no time
+        queued: several jobs wait at each worker, for which their transfer then takes no time. A few more copies are
+            begun then than are sent in the time that they take
         """
         known = seconds[~np.isnan(seconds)]
         self.depth, period = 0, self._period.value
         if len(known) and period is not None:
-            ahead = max(period, self._copy.value or 0.0)
-            service = float(known.mean()) + (0.0 if queued else TRANSFER)
-            self.depth = min(int(workers * ahead / service), MAX_DEPTH)
+            ahead, mean = max(period, self._copy.value or 0.0), float(known.mean())
+            depth = workers * period / (mean + TRANSFER)
+            if queued and self._rate.value is not None:
+                depth = max(depth, min(workers * ahead / mean, MORE * self._rate.value * ahead))
+            self.depth = min(int(depth), MAX_DEPTH)
             self.patience = MAX_WAIT + int(ahead / period) - 1 if period > 0 else MAX_WAIT

@@ -133,10 +133,13 @@ class Async(UpdatePolicy):
         made: list[tuple[BodyUpdateState, Job]] = []
         for state in copied:
             waited = driver.engine.step - driver.snapshots.step(state)
-            if idle <= len(made) and self.prefetch.depth and waited <= self.prefetch.patience:
+            if idle <= len(made) and self.prefetch.depth:
+                if waited > self.prefetch.patience:
+                    driver.snapshots.discard(state)
                 continue
             if (job := driver.make_job(state)) is not None:
                 made.append((state, job))
+        self.prefetch.on_sent(len(made), time.monotonic())
         if not made:
             return
         for (state, job), taken in zip(made, driver.source.submit_many([job for _, job in made]), strict=True):
