@@ -274,7 +274,7 @@ class FactorUpload:
 
     def _finish(self, builds: Builds) -> None:
         """Posts what was built beside the caller."""
-        self._builds.remove(builds)
+        self._builds = [each for each in self._builds if each is not builds]
         for body in builds.given:
             self._uploads[body].building = None
         errors = []
