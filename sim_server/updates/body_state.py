@@ -38,7 +38,7 @@ class SolveStatistics:
     def __init__(self, table: UpdateTable, index: int):
         self._table, self._index = table, index
         self.iteration_cost = MeanCell(table.iteration_cost, index)
-        self.first_excess = RunningMean()
+        self.first_excess = MeanCell(table.first_excess, index)
 
     def add(self, excess: Iterable[float], factor_steps: Iterable[int], newest: int) -> None:
         """Adds solves, one after another.
@@ -293,10 +293,10 @@ def excess(records: Any, floor: int, error_bound: Any) -> Any:
     return np.where(alone, np.where(alone, records["estimate"], 0.0) / error_bound, above)
 
 
-def observe_steps(states: Sequence[BodyUpdateState], table: UpdateTable, r: NDArray[Any], floor: int) -> None:
+def observe_steps(table: UpdateTable, r: NDArray[Any], floor: int) -> None:
     """Takes note of whole steps, as BodyUpdateState.observe does of each record of (steps, bodies), in seconds.
 
-    table: that of the states. Bodies whose factor changed within these steps are looked at one by one.
+    table: that of the bodies
     """
     steps, factor = len(r), r["factor_step"]
     above = excess(r, floor, table.error_bound)
@@ -315,8 +315,23 @@ def observe_steps(states: Sequence[BodyUpdateState], table: UpdateTable, r: NDAr
     table.lost += np.where(made >= 0, total, 0.0)
     table.latest[same] = above[-1, same]
     outdated = one & (made >= 0) & (made < table.newest)  # a newer factor was taken up: these solves count no more
-    for k in np.flatnonzero(~same & ~outdated).tolist():
-        states[k].solves.add(above[:, k].tolist(), factor[:, k].tolist(), states[k].factors.newest)
+    changed = np.flatnonzero(~same & ~outdated)
+    if len(changed):
+        _add_changed(table, changed, above[:, changed], factor[:, changed])
+
+
+def _add_changed(table: UpdateTable, row: NDArray[np.int64], above: Any, factor: Any) -> None:
+    """Adds steps (steps, rows) within which factors changed, as SolveStatistics.add does of each body."""
+    total, latest, lost, last = (c[row] for c in (table.excess, table.latest, table.lost, table.factor_step))
+    for each, made in zip(above, factor, strict=True):
+        counted = (made < 0) | (made >= table.newest[row])
+        new = counted & (made >= 0) & (made != last)
+        _add(table.first_excess, row[new], each[new])
+        last, total, lost = np.where(new, made, last), np.where(new, 0.0, total), np.where(new, 0.0, lost)
+        lost += np.where(counted & (made >= 0), each, 0.0)
+        total += np.where(counted, each, 0.0)
+        latest = np.where(counted, each, latest)
+    table.excess[row], table.latest[row], table.lost[row], table.factor_step[row] = total, latest, lost, last
 
 
 def on_factors(
@@ -337,9 +352,7 @@ def on_factors(
     table.newest[taken] = made[newer]
     table.used[taken] += 1
     table.lost[taken] = 0.0
-    table.excess[taken] = table.latest[taken] = [
-        state.solves.first_excess.value or 0.0 for state, better in zip(states, newer, strict=True) if better
-    ]
+    table.excess[taken] = table.latest[taken] = np.nan_to_num(table.first_excess[taken])
     table.sent[taken] = np.where(table.sent[taken] == NONE, made[newer], table.sent[taken])
     for state, factor, better in zip(states, factors, newer.tolist(), strict=True):
         if state.job.positions:

@@ -55,6 +55,7 @@ def seen(driver: Driver) -> list[tuple]:
             t.solves.lost,
             t.solves.factor_step,
             t.solves.max_factor_age,
+            t.solves.first_excess.value,
             t.failures.refused,
         )
         tuner = () if t.tuner is None else (t.tuner.kind, t.tuner.probe)
