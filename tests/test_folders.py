@@ -21,6 +21,26 @@ ALLOWED = {  # what each folder imports of its package
     "precond_worker.gpu": {"arrays", "errors", "symbolic"},
     "precond_worker.factorization": {"arrays", "errors", "gpu", "symbolic"},
     "precond_worker.network": {"errors", "remote_assembly"},
+    "clients.commands": {
+        "accuracy",
+        "client",
+        "errors",
+        "export",
+        "haptics",
+        "identify",
+        "load_test",
+        "log",
+        "materials",
+        "obstacle",
+        "options",
+        "plan",
+        "progress",
+        "replay",
+        "to_json",
+        "viewer",
+        "watch",
+        "web",
+    },
     "clients.accuracy": {"errors", "load_test", "log", "progress", "watch"},
     "clients.demo": {"client", "errors", "grab", "load_test", "log"},
     "clients.examples": {"client", "errors", "grab", "log"},
@@ -39,7 +59,7 @@ ALLOWED = {  # what each folder imports of its package
 ORDER = (  # of sim_server: each imports of those before it
     "errors", "arrays", "kernels", "mesh", "scene", "backends", "mechanics", "effects", "parameters", "simulation",
     "state", "updates", "checkpoint", "network", "certificates", "recording", "service", "explain", "replay",
-    "embedded", "gym", "cli", "__main__",
+    "embedded", "gym", "startup", "cli", "__main__",
 )  # fmt: skip
 REGISTRY = ("scene", "effects")  # a scene looks the names of effects up; the effects that it lists are imported later
 

@@ -11,6 +11,8 @@ import os
 import secrets
 from collections import deque
 from collections.abc import Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +30,7 @@ MARK = 32  # bytes of the random mark by which a buffer is found in its segment
 OVERHEAD = 1 << 16  # bytes of a segment for zenoh's own data
 SMALLEST = 1 << 14  # bytes
 RESERVE = 32 << 20  # bytes of /dev/shm left to others
+LARGE = 4 << 20  # bytes of a slot that takes more than a few milliseconds to make, as its memory is cleared
 
 
 class SlotsUnusable(Exception):
@@ -112,10 +115,15 @@ def _changed(path: Path) -> int:
 
 
 class SlotPool:
-    """Slots to lend, made when needed and used again. limit: bytes of all slots."""
+    """Slots to lend, made when needed and used again. Its methods are for one thread at a time.
+
+    limit: bytes of all slots
+    """
 
     def __init__(self, limit: int = shm_limits.POOL_LIMIT):
         self.limit = limit
+        self._thread = ThreadPoolExecutor(1, "slots")
+        self._making: dict[Future[Slot], int] = {}  # in that thread, with their capacities
         self._free: dict[int, deque[Slot]] = {}  # by capacity, each the longest unused first
         self._lent: dict[int, int] = {}  # how many still use it, by id
         self._returns = 0
@@ -137,26 +145,56 @@ class SlotPool:
 
     @property
     def bytes(self) -> int:
-        """Bytes of all slots, lent or free."""
-        return sum(slot.capacity for slot in self._live)
+        """Bytes of all slots, lent or free, and of those that are being made."""
+        return sum(slot.capacity for slot in self._live) + sum(self._making.values())
 
     @property
     def lent(self) -> int:
         """Number of slots lent now. A probe for tests."""
         return len(self._lent)
 
-    def lend(self, size: int, users: int = 1) -> Slot | None:
+    def lend(self, size: int, users: int = 1, beside: bool = False) -> Slot | None:
         """Lends a slot for `size` bytes, in a new generation; returns None if there is no memory for it.
 
         users: it is free again once it was given back so many times
+        beside: do not wait for a large one to be made: the first call begins to, and returns None
         """
-        most = 4 * max(size, SMALLEST)
-        capacity = min((c for c, slots in self._free.items() if slots and size <= c <= most), default=None)
+        self._take_made()
+        capacity = self._fitting(size)
+        if capacity is None and beside and size > LARGE:
+            self.prepare(size)
+            return None
         slot = self._make(_rounded(size)) if capacity is None else self._free[capacity].pop()
         if slot is not None:
             slot.lend()
             self._lent[id(slot)] = users
         return slot
+
+    def prepare(self, size: int) -> None:
+        """Begins to make a large slot for `size` bytes in a thread, unless one is free or being made; small ones are
+        made when they are lent."""
+        self._take_made()
+        if size <= LARGE or self._fitting(size) is not None or self.is_making(size):
+            return
+        if self._make_room(capacity := _rounded(size)):
+            self._making[self._thread.submit(Slot, capacity)] = capacity
+
+    def is_making(self, size: int) -> bool:
+        """True if a slot for so many bytes is being made in a thread."""
+        return any(_fits(size, capacity) for capacity in self._making.values())
+
+    def _take_made(self) -> None:
+        """Adds the slots that the thread has made to those that are free."""
+        for future in [each for each in self._making if each.done()]:
+            del self._making[future]
+            with suppress(SlotsUnusable):
+                slot = future.result()
+                self._live.add(slot)
+                self._put_back(slot)
+
+    def _fitting(self, size: int) -> int | None:
+        """Returns the smallest capacity of a free slot that fits."""
+        return min((c for c, slots in self._free.items() if slots and _fits(size, c)), default=None)
 
     def give_back(self, slot: Slot) -> None:
         """Takes a slot back from one of its users; a slot that is not lent is ignored."""
@@ -164,20 +202,27 @@ class SlotPool:
         if users > 1:
             self._lent[id(slot)] = users - 1
         elif users == 1:
-            self._returns += 1
-            slot.returned = self._returns
-            self._free.setdefault(slot.capacity, deque()).append(slot)
+            self._put_back(slot)
+
+    def _put_back(self, slot: Slot) -> None:
+        self._returns += 1
+        slot.returned = self._returns
+        self._free.setdefault(slot.capacity, deque()).append(slot)
 
     def discard(self, slot: Slot) -> None:
         """Takes back a slot that its borrower may still write to: it is not lent again, its memory is freed."""
         if self._lent.pop(id(slot), None) is not None:
             self._live.discard(slot)
 
-    def _make(self, capacity: int) -> Slot | None:
-        while not self._fits(capacity) and (unused := [slots for slots in self._free.values() if slots]):
+    def _make_room(self, capacity: int) -> bool:
+        """Frees unused slots as long as there is no memory for another one; False if there is none then."""
+        while not self._has_room(capacity) and (unused := [slots for slots in self._free.values() if slots]):
             oldest = min(unused, key=lambda slots: slots[0].returned)
             self._live.discard(oldest.popleft())  # its segment is freed with it
-        if not self._fits(capacity):
+        return self._has_room(capacity)
+
+    def _make(self, capacity: int) -> Slot | None:
+        if not self._make_room(capacity):
             return None
         try:
             slot = Slot(capacity)
@@ -188,14 +233,21 @@ class SlotPool:
         self._live.add(slot)
         return slot
 
-    def _fits(self, capacity: int) -> bool:
+    def _has_room(self, capacity: int) -> bool:
         return self.bytes + capacity <= self.limit and capacity + RESERVE <= shm_limits.free_bytes()
 
     def close(self) -> None:
         """Drops every slot; the segments are removed from /dev/shm."""
+        self._thread.shutdown(cancel_futures=True)
+        self._making.clear()
         self._free.clear()
         self._lent.clear()
         self._live.clear()
+
+
+def _fits(size: int, capacity: int) -> bool:
+    """True if a slot is large enough, and not far too large."""
+    return size <= capacity <= 4 * max(size, SMALLEST)
 
 
 def _rounded(size: int) -> int:

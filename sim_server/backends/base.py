@@ -8,6 +8,7 @@ a step and the solve between them, and has mailboxes that may be used from anoth
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from concurrent.futures import Future
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from enum import Enum, auto
@@ -441,6 +442,11 @@ class Backend(Protocol):
 
     def fetch(self, host: NDArray[Any]) -> NDArray[Any]:
         """Returns the array with what kernels have made of it."""
+        ...
+
+    def begin_fetch(self, host: NDArray[Any]) -> Future[NDArray[Any]]:
+        """Begins to copy what kernels have made of an array, beside the caller, who would wait for as long as another
+        thread allocates memory that a GPU reads. The host's array does not change."""
         ...
 
     def push(self, host: NDArray[Any]) -> None:

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """What a loop reports, as another thread reads it: step records and frames, oldest first."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -20,7 +20,8 @@ class Reports:
     """Base of the engines. loop: a ctypes structure with the fields of structs.Rings.
 
     records: room for so many, four steps at least; None: RECORDS, those of STEPS at least. frames: memory (capacity, 2,
-    nodes, 3) for x and v of frames, in the type that the device has them in.
+    nodes, 3) for x and v of frames, in the type that the device has them in. memory: makes so many bytes for records;
+    None: ordinary ones.
 
     frame_poses: of the frames returned last, by step: position [m] and quaternion of each obstacle (obstacles, 7)
     readings: of the records returned last, the numbers that effects leave of the body of each (measured.py), (k, most)
@@ -28,10 +29,13 @@ class Reports:
 
     records_dtype = RECORD
 
-    def __init__(self, loop: Any, bodies: int, dt: float, records: int | None, frames: NDArray[Any]):
+    def __init__(
+        self, loop: Any, bodies: int, dt: float, records: int | None, frames: NDArray[Any],
+        memory: Callable[[int], NDArray[np.uint8]] | None = None,
+    ):  # fmt: skip
         self.loop = loop
         room = max(RECORDS, STEPS * bodies) if records is None else max(records, 4 * bodies)
-        self._records = np.zeros(room, RECORD)
+        self._records = memory(room * RECORD.itemsize).view(RECORD) if memory else np.zeros(room, RECORD)
         self._frames = frames
         self._frame_steps = np.zeros(len(frames), np.int64)
         loop.dt = dt

@@ -20,6 +20,12 @@ HOST_DEVICE double tolerance_of(double tolerance, bool rested, int passes, int m
     return rested && passes < AT_REST && passes < most && RESTING < tolerance ? RESTING : tolerance;
 }
 
+// True if a sweep of the paths after a solve is to give rows to what enters something, for another solve; else that is held back. Where
+// there are no passes left, nothing would balance the forces of such rows. rounds: of passes after a sweep; passes: made; most: of any step.
+HOST_DEVICE bool gives_rows(int rounds, int passes, int most) {
+    return rounds < ROUNDS && passes < most;
+}
+
 // Part of its residual to which a pass is solved that need not be the last one: the nearer to the solution the more exactly, since the next
 // one then profits; but no more exactly than the law asks for (forcing terms: Eisenstat and Walker, Choosing the forcing terms in an
 // inexact Newton method, 1996). residual: contact residual before the pass. passes: made; most: of any step.
@@ -91,6 +97,46 @@ HOST_DEVICE double plane_on_way(const ObstacleTable& t, int obstacle, const doub
         gap += normal[m] * (from[m] - at_end[m]);
     }
     return gap;
+}
+
+// The obstacle, of all but `but`, that the way of a point enters first; -1: it enters none. entry(obstacle, from, to, begin, end): as
+// entry_of_way. back: out, the place in front of it, world frame
+template <class Entry>
+HOST_DEVICE int first_entered(const ObstacleTable& t, int count, int but, const double* from, const double* to, double* back, Entry entry) {
+    int first = -1;
+    double begin[3], end[3], earliest = NEVER;
+    for (int o = 0; o < count; ++o) {
+        if (o == but) continue;
+        const double time = entry(o, from, to, begin, end);
+        if (time > 1 || time >= earliest) continue;
+        first = o;
+        earliest = time;
+        for (int m = 0; m < 3; ++m) back[m] = begin[m] + SHORT_OF * time * (end[m] - begin[m]);
+        world_point(t.end + 7 * o, back, back);
+    }
+    return first;
+}
+
+// A point that is set back in front of an obstacle that moves may enter another one by that: the two close over it, and there is no place
+// for it. Of those in front of either it takes the one nearer to where it began: the other one would throw it, and whichever is looked
+// at last would win. back: in, out
+template <class Entry>
+HOST_DEVICE void place_between(const ObstacleTable& t, int count, int obstacle, const double* from, double* back, Entry entry) {
+    double other[3], way = 0, other_way = 0;
+    if (first_entered(t, count, obstacle, from, back, other, entry) < 0) return;
+    for (int m = 0; m < 3; ++m) {
+        way += (back[m] - from[m]) * (back[m] - from[m]);
+        other_way += (other[m] - from[m]) * (other[m] - from[m]);
+    }
+    for (int m = 0; m < 3 && other_way < way; ++m) back[m] = other[m];
+}
+
+// Where a point whose way enters obstacles is set back to. False if it enters none.
+template <class Entry>
+HOST_DEVICE bool place_in_front(const ObstacleTable& t, int count, const double* from, const double* to, double* back, Entry entry) {
+    const int first = first_entered(t, count, -1, from, to, back, entry);
+    if (first >= 0) place_between(t, count, first, from, back, entry);
+    return first >= 0;
 }
 
 // Stiffness of a row as a factor is to know it: one that slid counts with its normal stiffness alone. force, traction: of the row.

@@ -151,8 +151,12 @@ HOST_DEVICE bool take_face_row(const FaceTables& c, const Real* x, int body, int
     return true;
 }
 
-// Where a node of a triangle that passes an obstacle is set back to, world frame. time: of the passage
-HOST_DEVICE void place_before(const ObstacleTable& t, int obstacle, const NodeWay& way, double time, double* back) {
+// Where a node of a triangle that passes an obstacle is set back to, world frame. time: of the passage. count, from, entry: as of
+// place_in_front
+template <class Entry>
+HOST_DEVICE void place_before(const ObstacleTable& t, int count, int obstacle, const NodeWay& way, double time, const double* from, double* back,
+                              Entry entry) {
     for (int m = 0; m < 3; ++m) back[m] = way.begin[m] + SHORT_OF * time * (way.end[m] - way.begin[m]);
     world_point(t.end + 7 * obstacle, back, back);
+    place_between(t, count, obstacle, from, back, entry);
 }

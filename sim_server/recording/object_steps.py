@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Step records of a loop as ObjectStep messages.
 
-A column of struct Record (backends/cpu/native/ring_buffers.h) is the field of the same name, or that in FIELDS. A
+A column of struct Record (kernels/step_record.cuh) is the field of the same name, or that in FIELDS. A
 column without a field is not sent. NaN leaves an `optional` field unset.
 """
 

@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from sim_server.effects.touch import Interaction
 
 
+MAKERS = 512  # workers that are remembered
 PENDING = 1024  # updates kept after the last that the loop took up; in a pause each one replaces the one before
 
 T = TypeVar("T")
@@ -61,8 +62,8 @@ class ReplayRecorder:
         self._touched: Updates[list[Interaction]] = deque(maxlen=PENDING)
         movers = [m for m in (driver.simulation.contact, driver.simulation.holders) if m is not None]
         self._movers: dict[Movable, Updates[dict[str, Float64]]] = {m: deque(maxlen=PENDING) for m in movers}
-        self._with_nodes: set[int] = set()  # ids whose nodes the log holds
-        self._workers: dict[str, pb.WorkerInfo] = {}
+        self._with_nodes: set[int] = set()  # ids of the interactions of the last list; the log holds their nodes
+        self._workers: dict[str, pb.WorkerInfo] = {}  # makers of factors, oldest first
         driver.on_adopt.append(self._factors.append)
         self._touch = driver.simulation.touch
         driver.simulation.on_effect_update.append(self._on_update)
@@ -104,9 +105,9 @@ class ReplayRecorder:
         found = pb.TouchSet(step=step, interactions=map(messages.interaction, interactions))
         for a, message in zip(interactions, found.interactions, strict=True):
             if a.id not in self._with_nodes:
-                self._with_nodes.add(a.id)
                 message.held = a.nodes.astype("<i4").tobytes()
                 message.offsets = np.ascontiguousarray(a.offset, "<f8").tobytes()
+        self._with_nodes = {a.id for a in interactions}  # one that has left a list is in none after it
         return found
 
     def _factor(self, factor: Factor) -> pb.FactorUse:
@@ -115,6 +116,8 @@ class ReplayRecorder:
         else:
             if factor.worker not in self._workers:
                 self._workers.update({w.worker: w for w in self._link.dispatch.workers()})
+                for name in list(self._workers)[:-MAKERS]:
+                    del self._workers[name]
             maker = self._workers.get(factor.worker, pb.WorkerInfo(worker=factor.worker))
         exact = factor.method in ("", EXACT.name)
         library = maker.library if exact else "native"

@@ -39,6 +39,7 @@ from sim_server.service.halts import Halts
 from sim_server.service.health import Health
 from sim_server.service.need import NeedMeter
 from sim_server.service.pace import LOOK_PERIOD, PaceMonitor
+from sim_server.service.status_requests import StatusRequests
 from sim_server.service.tearing import Tearing
 from sim_server.service.telemetry import Telemetry
 from sim_server.simulation import Simulation
@@ -55,7 +56,6 @@ ROUND_PERIOD = 1e-3  # s that the service thread sleeps between rounds
 HOLD_PERIOD = 1e-4  # the same while the loop is to stand still
 WORKERS_PERIOD = 0.02  # s between checks of local workers
 SILENT_WAIT = 0.5  # s of waiting for first factors before a line tells of it
-STATUS_INTERVAL = 0.02  # s between two statuses that clients request, at least
 MAX_SETS = 64  # commands that wait to set parameters
 LOOP_NICE = -5  # of the loop's thread in real time: before workers, clients and our own threads on a full machine
 ENDLESS = 1 << 62
@@ -85,13 +85,15 @@ class Service:
         self._set_intervals()
         self._batches: deque[tuple[NDArray[Any], ...]] = deque()  # records and what comes with them
         self._failure: BaseException | None = None
-        self._status_replies: list[Callable[[pb.Reply], None]] = []  # of clients that requested a status
+        self._status_requests = StatusRequests(
+            lambda where: self.telemetry.publish_status(self._state(), where=where), self.telemetry.fetch_places
+        )
         self._halts = Halts(self.commands)
         self._between = BetweenSteps(self.engine.loop)
         self._start = Start(simulation)
         self._tearing, self._blades = Tearing(simulation), Blades(simulation)
         self._sets: deque[tuple[pb.Command, Callable[[pb.Reply], None]]] = deque()  # that set parameters
-        self._status_due = self._workers_due = self._pace_due = self._set_due = 0.0
+        self._workers_due = self._pace_due = self._set_due = 0.0
         self.check_workers: Callable[[], None] = lambda: None  # called every WORKERS_PERIOD
         self.check_page: Callable[[], None] = lambda: None  # as often
         self.pace = PaceMonitor(simulation.world.dt, self._advice, not self._on_gpu) if realtime else None
@@ -180,7 +182,7 @@ class Service:
             self._drain()
             self._between.run()
         self._halts.answer()
-        self._publish_status()
+        self._status_requests.answer()
         if not self._awaits_factors():
             self._check_pace()
         self.commands.release_absent(set(self.link.clients()))
@@ -202,7 +204,7 @@ class Service:
                     self._defer(command, reply)
                     continue
                 if command.verb == "status":
-                    self._status_replies.append(reply)
+                    self._status_requests.add(reply)
                     continue
                 while self._sets and command.verb in AFTER_SETS:
                     self._set_oldest()
@@ -295,15 +297,6 @@ class Service:
         self.commands.stamp(answer.status)
         reply(answer)
 
-    def _publish_status(self) -> None:
-        """Publishes one status for all requests since the last: it costs more than any other command."""
-        if self._status_replies and time.monotonic() >= self._status_due:
-            self.telemetry.publish_status(self._state(), where=True)
-            self._status_due = time.monotonic() + STATUS_INTERVAL
-            for reply in self._status_replies:
-                reply(pb.Reply())
-            self._status_replies.clear()
-
     def _awaits_factors(self) -> bool:
         """Returns True while the first step waits for factors. Tells of it: in the status, and if it lasts, a line."""
         first = self._first
@@ -374,11 +367,9 @@ class Service:
         """Passes on new step records with what objects exerted on obstacles and others, readings, and new frames."""
         contact = self.telemetry.contact
         undone = [*contact.count_clipped(records), *contact.crowded_nodes(), *contact.broken_ties()]
-        told = [*self.telemetry.count_unconverged(records), *self.telemetry.halved(records)]
-        told += [*self.telemetry.gained_energy(records), *self.telemetry.many_substeps(), *self.telemetry.losses()]
-        for line in [*told, *undone]:
+        for line in [*self.telemetry.warnings.warnings(records), *self.telemetry.losses(), *undone]:
             log.warning("%s", line)
-        for line in [*self.telemetry.count_runaways(records), *self.telemetry.not_finite(records)]:
+        for line in self.telemetry.warnings.errors(records):
             log.error("%s", line)
         if self.pace is not None and len(records):
             self.pace.add(records)

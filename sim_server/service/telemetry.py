@@ -3,7 +3,7 @@
 
 import os
 import time
-from collections import Counter, deque
+from concurrent.futures import Future
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -12,29 +12,29 @@ from numpy.typing import NDArray
 
 from protocol import messages_pb2 as pb
 from protocol.log_file import KEPT_EVERY
-from protocol.method import Method
 from sim_server.arrays import Float64
-from sim_server.backends.kinds import SLACK_OF_ENERGY
 from sim_server.backends.ring_buffers import as_bytes
 from sim_server.checkpoint.file import Checkpoint
 from sim_server.mechanics.named_points import NamedPoints
-from sim_server.mechanics.world import Body, World
+from sim_server.mechanics.world import Body
 from sim_server.network.link import ServerLink
 from sim_server.parameters import ParameterUpdate
 from sim_server.recording import messages
-from sim_server.recording.object_steps import Additions, Encoded, Reactions, Readings
+from sim_server.recording.object_steps import Encoded, Reactions, Readings
 from sim_server.recording.obstacles import pose_messages
 from sim_server.recording.recorder import Recorder
 from sim_server.recording.replay_recorder import ReplayRecorder
 from sim_server.recording.wire import repeated
+from sim_server.service.acting_interactions import ActingInteractions
 from sim_server.service.commands import Commands
 from sim_server.service.contact_telemetry import ContactTelemetry
 from sim_server.service.cuts import CutTelemetry
-from sim_server.service.event_counts import EventCounts
 from sim_server.service.log_thinning import LogThinning
 from sim_server.service.reaction_telemetry import ReactionTelemetry
+from sim_server.service.run_summary import RunSummary
+from sim_server.service.step_warnings import StepWarnings
 from sim_server.service.unsent_steps import UnsentSteps
-from sim_server.simulation import Simulation
+from sim_server.updates.body_state import BodyUpdateState
 from sim_server.updates.driver import Driver
 
 if TYPE_CHECKING:
@@ -46,8 +46,6 @@ STATUS_PERIOD = 1.0  # s
 LOOK_PERIOD = 0.02  # s between checks for subscribers
 MAX_BATCH = 4096  # step records sent together at most
 BEHIND = 0.5  # part of the loop's room for records that is full: the log does not follow
-STATISTICS_STEPS = 1000  # last steps that percentiles and means are taken over
-MANY_SUBSTEPS = 10_000  # explicit ones of a step, of which it is told
 ENERGY_STEPS = 20  # steps between elastic energies in real time: one costs up to a fifth of a step
 
 
@@ -60,6 +58,8 @@ class Telemetry:
     contact: the part that tells of obstacles
     metrics: is given records and statuses; None: nobody asks for it
     reactions: the part that sends forces as they come
+    summary: what the status tells of steps
+    warnings: what went wrong
     """
 
     def __init__(
@@ -72,7 +72,6 @@ class Telemetry:
     ):
         self.driver, self.link, self.recorder, self.patient = driver, link, recorder, patient
         self.simulation, self.engine = driver.simulation, driver.engine
-        self.commands = commands
         self.contact = ContactTelemetry(self.simulation, link, recorder)
         self.reactions = ReactionTelemetry(self.simulation, link)
         self.cuts = CutTelemetry(self.simulation, link, recorder, patient)
@@ -83,29 +82,14 @@ class Telemetry:
         self._unsent = UnsentSteps(MAX_BATCH)
         self.thinning = LogThinning(len(self.simulation.world.bodies))
         self._told_losses: set[str] = set()
-        bodies = len(self.simulation.world.bodies)
-        self._window = np.zeros((bodies, STATISTICS_STEPS), np.int32)  # iterations of the last steps
-        self._told = np.zeros(bodies, np.int64)  # steps of each body
-        self.seconds: deque[float] = deque(maxlen=STATISTICS_STEPS)
-        self._last: NDArray[Any] = np.zeros(bodies, self.engine.records_dtype)
-        self._last_reactions: dict[int, tuple[Reactions, int]] = {}  # by body, and the number of its record in them
-        self._last_readings: dict[int, Readings] = {}  # by body, one record
-        self._not_finite: set[str] = set()  # objects of which it was said
-        self.solves = 0
+        self.summary, self.warnings = RunSummary(driver), StepWarnings(self.simulation)
+        self.acting = ActingInteractions(self.simulation, commands)
         self.pace = ""  # why the run does not keep pace with the clock; empty: it does, or need not
-        self.unconverged: Counter[str] = Counter()  # solves by status, of those that did not converge
-        self._energy = np.full(bodies, np.nan)  # by body, of the last step with all of kinetic, elastic and gravity [J]
-        self.runaways: Counter[int] = Counter()  # steps by body
-        self.events = EventCounts()
-        self._halved: set[int] = set()  # bodies of which it was said
-        self._told_substeps = False
-        self._gained: set[int] = set()  # bodies of which it was said that they have gained energy
         self._has_listeners = False
         self._due = {"steps": 0.0, "state": 0.0, "status": 0.0, "look": 0.0}
         self._has_viewers = False
-        self._interactions: dict[int, pb.Interaction] = {}
-        self._over: set[int] = set()  # ids of those of them that act no more
         self._points: list[NamedPoints] = []
+        self._positions: Future[Float64] | None = None  # for the next status with places
         self._stale_moduli: set[str] = set()  # keys of parameters that were set
         self.simulation.parameters.on_set.append(self._on_set)
         self.metrics: ServerMetrics | None = None
@@ -151,10 +135,10 @@ class Telemetry:
         if len(records):
             if self.metrics is not None:
                 self.metrics.add(records)
-            self.seconds.extend(records["whole"][records["body"] == 0].tolist())
-            self.update_summary(records, reactions, readings)
+            self.summary.seconds.extend(records["whole"][records["body"] == 0].tolist())
+            self.summary.update(records, reactions, readings)
             self.reactions.publish(records, reactions)
-            self._note_interactions()
+            self.acting.note()
             if self.recorder:
                 self.recorder.steps(self._logged(self.recorder, records, reactions, readings), block=self.patient)
             if self.link.wants_steps():
@@ -166,30 +150,7 @@ class Telemetry:
                 sent = pb.Steps.FromString(repeated(pb.Steps.STEPS_FIELD_NUMBER, steps))
                 sent.left_out = left_out
                 self.link.publish_steps(sent)
-            self._forget_interactions()
-
-    def update_summary(
-        self, records: NDArray[Any], reactions: Reactions | None = None, readings: Readings | None = None
-    ) -> None:
-        """Keeps what the status tells of steps: records, reactions and readings, iterations and energies."""
-        order = np.argsort(records["body"], kind="stable")
-        present, first, counts = np.unique(records["body"][order], return_index=True, return_counts=True)
-        at = self._told[present].repeat(counts) + np.arange(len(order)) - first.repeat(counts)
-        self._window[present.repeat(counts), at % STATISTICS_STEPS] = records["iterations"][order]
-        self._told[present] += counts
-        newest = order[first + counts - 1]
-        as_bytes(self._last)[present] = as_bytes(records)[newest]
-        self.events.add(records)
-        if reactions is not None and reactions.any:
-            for body, record in zip(present.tolist(), newest.tolist(), strict=True):
-                self._last_reactions[body] = reactions, record
-        if readings is not None and readings.measured:
-            for body, record in zip(present.tolist(), newest.tolist(), strict=True):
-                self._last_readings[body] = readings[record : record + 1]
-        with np.errstate(all="ignore"):  # a body that blew up
-            energy = records["kinetic"] + records["elastic"] + records["gravity"]
-        evaluated = np.flatnonzero(np.isfinite(records["elastic"]))
-        self._energy[records["body"][evaluated]] = energy[evaluated]
+            self.acting.forget()
 
     def _logged(
         self, recorder: Recorder, records: NDArray[Any], reactions: Reactions, readings: Readings | None
@@ -209,64 +170,11 @@ class Telemetry:
     ) -> list[Encoded]:  # fmt: skip
         """Makes messages for the log and for subscribers only: it is the most expensive part of telemetry."""
         excess = np.array([state.solves.excess for state in self.driver.bodies])[records["body"]]
-        additions = self._acting(records)
+        additions = self.acting.acting(records)
         return messages.encoded_steps(
-            self.simulation, records, self._method, reactions, readings, excess, self.driver.age_bound(), additions,
-            left_out,
+            self.simulation, records, self.driver.method, reactions, readings, excess, self.driver.age_bound(),
+            additions, left_out,
         )  # fmt: skip
-
-    def _method(self, body: int, step: int) -> Method | None:
-        """Returns how the factor of a step was made."""
-        return self.driver.bodies[body].factors.method(step)
-
-    def _latest(self, bound: int) -> dict[int, pb.ObjectStep]:
-        """Returns the last steps by body. bound: age that factors are to have at most"""
-        bodies, additions = np.flatnonzero(self._told), Additions()
-        records = self._last[bodies]
-        for number, body in enumerate(bodies.tolist()):
-            own, record = Additions(), records[number : number + 1]
-            if body in self._last_reactions:
-                reactions, at = self._last_reactions[body]
-                reactions[at : at + 1].add_to(own, record)
-            if body in self._last_readings:
-                self._last_readings[body].add_to(own, [self.simulation.world.bodies[body].name])
-            if own:
-                additions[number] = own[0]
-        excess = np.array([self.driver.bodies[body].solves.excess for body in bodies.tolist()])
-        steps = messages.encoded_steps(
-            self.simulation, records, self._method, excess=excess, age_bound=bound, additions=additions
-        )
-        return {body: pb.ObjectStep.FromString(s.data) for body, s in zip(bodies.tolist(), steps, strict=True)}
-
-    def _note_interactions(self) -> None:
-        """Takes note of the interactions that act in steps, of which messages tell."""
-        if self.commands is None or self.simulation.touch is None:
-            return
-        known = {i.id: i for i in self.commands.interactions()}
-        clock, dt = float(self.simulation.system.clock[0]), self.simulation.world.dt
-        for id in set(self._interactions) - set(known) - self._over:  # it acted up to the step under way at most
-            interaction = self._interactions[id]
-            interaction.duration = min(interaction.duration, max(clock + dt - interaction.start, 0))
-            self._over.add(id)
-        self._interactions.update(known)
-
-    def _forget_interactions(self) -> None:
-        """Forgets those that are over: the messages of steps in which they acted are made."""
-        for id in self._over:
-            del self._interactions[id]
-        self._over.clear()
-
-    def _acting(self, records: NDArray[Any]) -> Additions:
-        """Returns the interactions that acted in the steps of records."""
-        additions, dt = Additions(), self.simulation.world.dt
-        bodies = {body.name: body.index for body in self.simulation.world.bodies} if self._interactions else {}
-        begin = records["time"] - dt
-        for i in self._interactions.values():
-            acted = (i.start <= begin + 0.5 * dt) & (begin + 0.5 * dt < i.start + i.duration)
-            if i.start >= 0:
-                for number in np.flatnonzero(acted & (records["body"] == bodies.get(i.object, -1))).tolist():
-                    additions[number].interactions.append(i)
-        return additions
 
     def frames(self) -> None:
         """Sends states and poses of obstacles, to the log at the scene's rate, the newest ones to viewers."""
@@ -296,11 +204,8 @@ class Telemetry:
         world, step = self.simulation.world, self.engine.step
         for body in world.bodies:
             if name in ("", body.name):
-                self.runaways.pop(body.index, None)
-                self.events.clear(body.index)
-                self._halved.discard(body.index)
-                self._gained.discard(body.index)
-                self._not_finite.discard(body.name)
+                self.warnings.on_reset(body)
+                self.summary.events.clear(body.index)
         self.contact.on_reset()
         if self.replay_recorder:
             self.replay_recorder.write(self.patient)  # parameters that the loop had before
@@ -361,129 +266,79 @@ class Telemetry:
         self._due["status"] = time.monotonic() + STATUS_PERIOD
         self._renew_moduli()
         self.cuts.take()
-        loop, world = self.engine.loop, self.simulation.world
-        p50, p99, most = self.percentiles()
-        status = pb.Status(
-            scene=self.simulation.scene.name, state=state, step=self.engine.step, time=self.engine.step * world.dt,
-            dt=world.dt, step_p50=p50, step_p99=p99, step_max=most, late_steps=loop.late_steps,
-            device=self.simulation.world.backend.name,
-            pid=os.getpid(), uptime=time.monotonic() - self.started, pace=self.pace,
-        )  # fmt: skip
-        dropped = loop.frames_dropped + (self.recorder.dropped if self.recorder else 0)
-        status.frames_dropped, status.records_dropped = dropped, loop.records_dropped + loop.others_dropped
-        status.records_lost = self.recorder.lost if self.recorder else 0
-        status.records_thinned = self.thinning.count
-        status.recording_failure = self.recorder.failure[:400] if self.recorder else ""
+        status = self._status_of_run(state)
         bound = self.driver.age_bound()
-        latest = self._latest(bound)
-        means = self._window.sum(axis=1) / np.clip(self._told, 1, STATISTICS_STEPS)
+        latest, means = self.summary.latest(bound), self.summary.mean_iterations()
         for updates in self.driver.bodies:
             body = updates.body
-            status.objects.append(
-                pb.ObjectStatus(
-                    object=body.name,
-                    nodes=body.last - body.first,
-                    tets=len(body.mesh.tets) - self.cuts.removed.get(body.name, 0),
-                    last=latest.get(body.index),
-                    mean_iterations=float(means[body.index]),
-                    excess=updates.solves.excess,
-                    factors_used=updates.factors.used,
-                    factors_refused=updates.failures.refused,
-                    factors_mended=updates.factors.regularized,
-                    refusal=updates.failures.reason[:400],
-                    in_flight=updates.job.in_flight,
-                    factor_age=updates.factors.age(status.step),
-                    factor_age_max=updates.solves.max_factor_age,
-                    factor_age_bound=bound,
-                    runaway_steps=self.runaways[body.index],
-                    total_energy=None if np.isnan(energy := self._energy[body.index]) else float(energy),
-                    clipped=self.contact.clipped[body.index],
-                    crowded=self.contact.crowded[body.index],
-                    events=self.events.of(body.index),
-                )
-            )
+            found = self._status_of(updates, status.step)
+            found.mean_iterations, found.factor_age_bound = float(means[body.index]), bound
+            if body.index in latest:
+                found.last.CopyFrom(latest[body.index])
+            status.objects.append(found)
         status.obstacles.extend(pose_messages(self.simulation, status.step, fixed=True))
         if where:
             messages.add_places(self._places(), status)
+        self._positions = None  # those that come later would be old in the next status
         self.link.publish_status(status)
         if self.metrics is not None:
             self.metrics.status = status
 
+    def _status_of_run(self, state: str) -> pb.Status:
+        """Returns a status without objects."""
+        loop, world = self.engine.loop, self.simulation.world
+        p50, p99, most = self.summary.percentiles()
+        status = pb.Status(
+            scene=self.simulation.scene.name, state=state, step=self.engine.step, time=self.engine.step * world.dt,
+            dt=world.dt, step_p50=p50, step_p99=p99, step_max=most, late_steps=loop.late_steps,
+            device=world.backend.name, pid=os.getpid(), uptime=time.monotonic() - self.started, pace=self.pace,
+        )  # fmt: skip
+        status.frames_dropped, status.records_dropped = loop.frames_dropped, loop.records_dropped + loop.others_dropped
+        status.records_thinned = self.thinning.count
+        if self.recorder:
+            status.frames_dropped += self.recorder.dropped
+            status.records_lost = self.recorder.lost
+            status.recording_failure = self.recorder.failure[:400]
+        return status
+
+    def _status_of(self, updates: BodyUpdateState, step: int) -> pb.ObjectStatus:
+        """Returns what the status tells of an object, but for what `summary` knows of all together."""
+        body, factors, failures = updates.body, updates.factors, updates.failures
+        return pb.ObjectStatus(
+            object=body.name,
+            nodes=body.last - body.first,
+            tets=len(body.mesh.tets) - self.cuts.removed.get(body.name, 0),
+            excess=updates.solves.excess,
+            factors_used=factors.used,
+            factors_refused=failures.refused,
+            factors_mended=factors.regularized,
+            refusal=failures.reason[:400],
+            in_flight=updates.job.in_flight,
+            factor_age=factors.age(step),
+            factor_age_max=updates.solves.max_factor_age,
+            runaway_steps=self.warnings.runaways[body.index],
+            total_energy=self.summary.total_energy(body.index),
+            clipped=self.contact.clipped[body.index],
+            crowded=self.contact.crowded[body.index],
+            events=self.summary.events.of(body.index),
+        )
+
+    def fetch_places(self) -> bool:
+        """Begins to fetch the positions of all nodes for the next status; True once they are there."""
+        if self._positions is None:
+            self._positions = self.simulation.world.backend.begin_fetch(self.simulation.world.x)
+        return self._positions.done()
+
     def _places(self) -> list[NamedPoints]:
-        """Returns the named points of all objects at their present positions."""
+        """Returns the named points of all objects at the positions that were fetched, else the present ones."""
         world = self.simulation.world
         self._points = self._points or [NamedPoints(world, body) for body in world.bodies]
-        x = world.backend.fetch(world.x)
+        self.fetch_places()
+        assert self._positions is not None
+        x = self._positions.result()
         for points in self._points:
             points.now(x)
         return self._points
-
-    def percentiles(self) -> tuple[float, float, float]:
-        """Returns p50, p99 and maximum of the time [s] of the last steps."""
-        if not self.seconds:
-            return 0.0, 0.0, 0.0
-        seconds = np.array(self.seconds)
-        return float(np.percentile(seconds, 50)), float(np.percentile(seconds, 99)), float(seconds.max())
-
-    def count_unconverged(self, records: NDArray[Any]) -> list[str]:
-        """Counts solves that did not converge, by status; returns a line for the first."""
-        self.solves += len(records)
-        failed = records[(records["status"] != pb.CONVERGED) & (records["status"] != pb.RUNAWAY)]
-        if not len(failed):
-            return []
-        first = not self.unconverged
-        self.unconverged.update(pb.SolveStatus.Name(int(s)).lower() for s in failed["status"])
-        if not first:
-            return []
-        r, status = failed[0], next(iter(self.unconverged))
-        name = self.simulation.world.bodies[int(r["body"])].name
-        column = "contact_residual" if r["status"] == pb.CONTACT else "residual"
-        return [
-            f"object {name!r}, step {int(r['step'])}: not converged ({status}, residual {float(r[column]):.1e}); "
-            "further ones are counted"
-        ]
-
-    def not_finite(self, records: NDArray[Any]) -> list[str]:
-        """Returns a line for each object whose solve met numbers that are not finite for the first time."""
-        return not_finite_lines(self.simulation, records, self._not_finite)
-
-    def count_runaways(self, records: NDArray[Any]) -> list[str]:
-        """Counts steps of bodies that have run away; returns a line for each new one, with the cause."""
-        away, lines = records[records["status"] == pb.RUNAWAY], []
-        for r in away[np.unique(away["body"], return_index=True)[1]]:
-            body = self.simulation.world.bodies[int(r["body"])]
-            if body.index not in self.runaways:
-                frozen = self.simulation.energies.freezes
-                then = "it is frozen where the step began" if frozen else "it goes on"
-                lines.append(
-                    f"object {body.name!r}, step {int(r['step'])}: runaway: {cause_of(r)}; {then} "
-                    f"(solver.on_runaway = {self.simulation.scene.solver.on_runaway!r}). A smaller dt, more "
-                    "linearizations or the scheme backward_euler may help"
-                )
-        self.runaways.update(away["body"].tolist())
-        return lines
-
-    def gained_energy(self, records: NDArray[Any]) -> list[str]:
-        """Returns a line for each object that has far more energy than it was given, kinetic and elastic together, for
-        the first time. Steps whose elastic energy is known; what moves little is not found by its kinetic energy."""
-        lines, world = [], self.simulation.world
-        if world.explicit or (world.loading and world.backend.name == "gpu"):
-            return []
-        energy = records["kinetic"] + records["elastic"]
-        for r in records[energy > SLACK_OF_ENERGY * np.maximum(records["budget"], 0.0)]:
-            body = world.bodies[int(r["body"])]
-            floor = least_energy(world, body)
-            if world.loading and world.load[body.nodes].any():  # the work of loads is known to a part alone
-                continue
-            if body.index in self._gained or not r["kinetic"] + r["elastic"] > 2 * r["budget"] + floor:
-                continue
-            self._gained.add(body.index)
-            lines.append(
-                f"object {body.name!r}, step {int(r['step'])}: it has {r['kinetic'] + r['elastic']:.3g} J, kinetic and "
-                f"elastic, where start and loads account for {r['budget']:.3g} J: an error of the time step. A smaller "
-                "dt or more linearizations may help"
-            )
-        return lines
 
     def losses(self) -> list[str]:
         """Returns a line when records are missing for the first time, of each kind."""
@@ -498,65 +353,3 @@ class Telemetry:
                 self._told_losses.add(line)
                 found.append(f"step {self.engine.step}: {line}; further ones are counted")
         return found
-
-    def many_substeps(self) -> list[str]:
-        """Returns a line, once, if a step makes very many explicit substeps: while the first one is under way."""
-        count, dt = self.engine.substeps, self.simulation.world.dt
-        if self._told_substeps or count <= MANY_SUBSTEPS:
-            return []
-        self._told_substeps = True
-        return [
-            f"a step of dt = {dt:g} s takes {count:,} explicit substeps of {dt / count:.2g} s, each of which evaluates "
-            "all forces: the stiffest or smallest element allows none longer. What helps: softer material, no slivers, "
-            'or integrator.scheme = "backward_euler" or "ros2", which have no such limit'
-        ]
-
-    def halved(self, records: NDArray[Any]) -> list[str]:
-        """Returns a line for each object whose step was made again by short ones for the first time."""
-        lines = []
-        for r in records[records["halvings"] > 0]:
-            body = self.simulation.world.bodies[int(r["body"])]
-            if body.index not in self._halved:
-                self._halved.add(body.index)
-                lines.append(
-                    f"object {body.name!r}, step {int(r['step'])}: ran away; made again by {2 ** int(r['halvings'])} "
-                    "short steps, as the next ones are; further ones are counted"
-                )
-        return lines
-
-
-def not_finite_lines(simulation: Simulation, records: NDArray[Any], known: set[str]) -> list[str]:
-    """Returns a line for each object whose solve met numbers that are not finite for the first time.
-
-    known: objects of which that was said before; the names of new ones are added
-    """
-    lines = []
-    for r in records[records["bad_node"] >= 0]:
-        name = simulation.world.bodies[int(r["body"])].name
-        if name not in known:
-            known.add(name)
-            begin = float(r["time"]) - simulation.world.dt / 2
-            refused = [x for x in simulation.refusals() if x.body == int(r["body"]) and x.time < begin]
-            latest = max(refused, key=lambda x: x.time, default=None)  # before, a line search may have tried one
-            why = str(latest) if latest else f"force is not finite at node {int(r['bad_node'])}"
-            lines.append(
-                f"object {name!r}, step {int(r['step'])}: {why}; "
-                "it goes back to where the step before began and rests there"
-            )
-    return lines
-
-
-def least_energy(world: World, body: Body) -> float:
-    """Energy of a body all of whose nodes move by a thousandth of its size in a step, below which a balance may be
-    rounding [J]; the floor of kernels/energy_balance.cuh."""
-    size = float(np.linalg.norm(np.ptp(world.rest[body.nodes], axis=0)))
-    return 0.5 * float(world.mass[body.nodes].sum()) * (1e-3 * size / world.dt) ** 2
-
-
-def cause_of(r: np.void) -> str:
-    """Says what a record (structs.RECORD) shows of a body that ran away."""
-    if not (np.isfinite(r["kinetic"]) and np.isfinite(r["gravity"])):
-        return "its positions or velocities are no finite numbers"
-    if r["kinetic"] > SLACK_OF_ENERGY * max(r["budget"], 0.0):
-        return f"kinetic energy {r['kinetic']:.3g} J, where start and loads account for {r['budget']:.3g} J"
-    return f"two of its nodes moved {r['stride']:.3g} m apart within a step"

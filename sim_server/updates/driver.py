@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from protocol.factor import Factor
+from protocol.method import Method
 from sim_server.arrays import Float64
 from sim_server.backends.base import Capability
 from sim_server.backends.cpu.structs import REACTION
@@ -342,6 +343,10 @@ class Driver:
         assert state.tuner is not None
         settings = self.engine.settings(state.body.index)
         settings.kind, settings.probe = state.tuner.kind, state.tuner.probe
+
+    def method(self, body: int, step: int) -> Method | None:
+        """Returns how the factor of a step was made."""
+        return self.bodies[body].factors.method(step)
 
     def age_bound(self) -> int:
         """Returns the age [steps] that no factor exceeds while all goes well, by what was measured; -1: not known."""

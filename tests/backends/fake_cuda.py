@@ -2,17 +2,21 @@
 """A GPU made of NumPy for the native GPU loop: work is put off as a real one does it, so that order mistakes show."""
 
 import ctypes as c
+import subprocess
+import tempfile
 from collections import deque
 from collections.abc import Callable
-from functools import partial
+from functools import cache, partial
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from sim_server.backends.compiler import INCLUDE, SOURCES, compiler
 from sim_server.backends.gpu import structs
 from sim_server.backends.gpu.loop import CAPACITY, MANY, DeviceLoop
 from sim_server.backends.gpu.solver import PCG_RESULT
-from sim_server.backends.gpu.structs import ENERGY_RECORD, STEP_TIMESTAMP
+from sim_server.backends.gpu.structs import ENERGY_RECORD, RECORDS, STEP_RECORDS, STEP_TIMESTAMP
 
 NOT_READY = 600
 p, size, u64 = c.c_void_p, c.c_size_t, c.c_uint64
@@ -23,7 +27,7 @@ SIGNATURES = {
 }  # fmt: skip
 Work = Callable[[], None]
 
-ELASTIC_GRAPH, BALANCE_GRAPH = 11, 12  # handles of graphs
+ELASTIC_GRAPH, BALANCE_GRAPH, RECORD_GRAPHS = 11, 12, (15, 16)  # handles of graphs
 STEPS = {7: 1, 8: MANY, 9: 1, 10: MANY}  # of the graphs that step
 TIMED = (9, 10)  # those that note the time first
 
@@ -145,6 +149,33 @@ class FakeDevice:
         return False
 
 
+@cache
+def records_library() -> c.CDLL:
+    """The text of step_records.cu, run by threads of the processor."""
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        text = f"""#include "cuda_threads.h"
+            {RECORDS.checked()}
+            extern "C" void write(int blocks, const StepRecords* a) {{
+                launch(blocks, THREADS, [&] {{ write_records(*a); }});
+            }}
+            """
+        (folder / "records.cpp").write_text(text)
+        paths = [f"-I{p}" for p in (Path(__file__).parent, SOURCES / "backends/gpu", INCLUDE)]
+        command = [compiler(), "-std=c++17", "-O1", "-shared", "-fPIC", "-pthread", *paths]
+        subprocess.run([*command, str(folder / "records.cpp"), "-o", str(folder / "records.so")], check=True)
+        return c.CDLL(str(folder / "records.so"))
+
+
+def write_records(results: NDArray, energies: NDArray, loop: structs.GpuLoop, target: int, blocks: int = 2) -> None:
+    """Writes the records that a target says into the ring of a loop. results, energies: (capacity, bodies)"""
+    params = np.zeros((), STEP_RECORDS)
+    params["target"], params["results"], params["energies"] = target, results.ctypes.data, energies.ctypes.data
+    params["records"], params["room"] = loop.records, loop.record_capacity
+    params["capacity"], params["bodies"] = results.shape
+    records_library().write(blocks, c.c_void_p(params.ctypes.data))
+
+
 class FakeScene:
     """A loop over `bodies` bodies of two nodes with one block of A a node. Step k (from 0) leaves x = k + 1, v = -k,
     A = k; the settings of a body (one int64) come back as its iterations, its factor (one int64) as its factor_step.
@@ -165,13 +196,14 @@ class FakeScene:
         addresses = {n: getattr(self, n).ctypes.data for n in ("x", "v", "values")}
         self.loop = DeviceLoop(
             device, [(2 * k, 2 * k + 2) for k in range(bodies)], np.arange(nodes + 1, dtype=np.int32), 0.5,
-            [*boxes, (self.argument.ctypes.data, 8)], self.results, self.stamps, self.clock, records,
-            real, energy_records=self.energies, **addresses,
+            [*boxes, (self.argument.ctypes.data, 8)], self.stamps, self.clock, records, real, **addresses,
         )  # fmt: skip
         device.graphs = {graph: partial(self._steps, steps, graph in TIMED) for graph, steps in STEPS.items()}
         device.graphs[ELASTIC_GRAPH] = self._elastic
         device.graphs[BALANCE_GRAPH] = lambda: None  # steps tell their energies themselves
-        self.loop.use_graphs(list(STEPS), BALANCE_GRAPH, ELASTIC_GRAPH)
+        for graph, target in zip(RECORD_GRAPHS, self.loop.targets, strict=True):
+            device.graphs[graph] = partial(write_records, self.results, self.energies, self.loop.loop, target)
+        self.loop.use_graphs(list(STEPS), RECORD_GRAPHS, BALANCE_GRAPH, ELASTIC_GRAPH)
 
     def _steps(self, steps: int, stamp: bool = False) -> None:
         if stamp:

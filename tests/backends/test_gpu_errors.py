@@ -8,11 +8,10 @@ from pathlib import Path
 
 import pytest
 
-from sim_server import cli
 from sim_server.backends.compiler import CompileError
 from sim_server.backends.gpu import device
-from sim_server.cli import choose_device
 from sim_server.errors import DeviceError
+from sim_server.startup.device import choose_device
 
 ROOT = Path(__file__).parents[2]
 
@@ -94,7 +93,7 @@ def test_without_a_gpu_one_message_says_what_to_do(cupy, found, text):
 )
 def test_auto_goes_on_with_the_cpu_and_says_why_in_one_line(cupy, found, text, monkeypatch):
     cupy(None if found is None else fake(found))
-    monkeypatch.setattr(cli, "nvidia_device", lambda: True)
+    monkeypatch.setattr("sim_server.startup.device.nvidia_device", lambda: True)
     said: list[str] = []
     assert choose_device("auto", said.append) == "cpu"
     assert len(said) == 1
@@ -105,7 +104,7 @@ def test_auto_goes_on_with_the_cpu_and_says_why_in_one_line(cupy, found, text, m
 @pytest.mark.parametrize("installed", [None, fake(0)], ids=["no cupy", "cupy"])
 def test_auto_says_nothing_of_gpus_where_there_is_none(cupy, installed, monkeypatch):
     cupy(installed)
-    monkeypatch.setattr(cli, "nvidia_device", lambda: False)
+    monkeypatch.setattr("sim_server.startup.device.nvidia_device", lambda: False)
     said: list[str] = []
     assert choose_device("auto", said.append) == "cpu"
     assert said == []
@@ -113,7 +112,7 @@ def test_auto_says_nothing_of_gpus_where_there_is_none(cupy, installed, monkeypa
 
 def test_auto_takes_a_gpu_that_is_there_and_says_nothing(cupy, monkeypatch):
     cupy(fake())
-    monkeypatch.setattr(cli, "nvidia_device", lambda: True)
+    monkeypatch.setattr("sim_server.startup.device.nvidia_device", lambda: True)
     said: list[str] = []
     assert choose_device("auto", said.append) == "gpu"
     assert [choose_device(d, said.append) for d in ("cpu", "gpu")] == ["cpu", "gpu"]

@@ -18,7 +18,16 @@ from sim_server.backends.gpu.structs import NEWTON_RESULT, PAIR_SUM, STAGE_RESUL
 from sim_server.backends.measured import Measured
 from sim_server.backends.rosenbrock import FORMS
 from sim_server.errors import DeviceLost
-from tests.backends.fake_cuda import BALANCE_GRAPH, ELASTIC_GRAPH, NOT_READY, STEPS, TIMED, FakeScene, number
+from tests.backends.fake_cuda import (
+    BALANCE_GRAPH,
+    ELASTIC_GRAPH,
+    NOT_READY,
+    RECORD_GRAPHS,
+    STEPS,
+    TIMED,
+    FakeScene,
+    number,
+)
 
 MATRIX_GRAPH, GRABS_GRAPH = 13, 14
 ONE_STEP = next(graph for graph, steps in STEPS.items() if steps == 1 and graph not in TIMED)
@@ -30,7 +39,7 @@ def steps_ahead(scene: FakeScene) -> list[int]:
     launch = scene.device.graph_launch
 
     def counted(graph: int, stream: int) -> int:
-        if graph != BALANCE_GRAPH:
+        if graph not in (BALANCE_GRAPH, *RECORD_GRAPHS):
             ahead.append(int(scene.loop.loop.launched) - scene.loop.step)
         return launch(graph, stream)
 
@@ -122,7 +131,7 @@ def test_the_elastic_energy_is_evaluated_after_the_steps_where_it_is_wanted():
     graphs = launched(scene)
     scene.loop.run(10 * BATCH)
     assert np.isnan(scene.loop.records()["elastic"]).all()
-    assert BALANCE_GRAPH in graphs and ELASTIC_GRAPH not in graphs
+    assert set(RECORD_GRAPHS) < set(graphs) and ELASTIC_GRAPH not in graphs
 
 
 def test_what_the_device_has_frozen_is_told_as_a_runaway():
@@ -351,6 +360,23 @@ def test_records_that_nobody_fetches_are_dropped_by_whole_steps_and_counted():
     kept = scene.loop.records()
     assert kept["step"].tolist() == np.repeat(np.arange(1, 5), 3).tolist()
     assert len(kept) + scene.loop.loop.records_dropped == 120
+
+
+def test_records_are_written_by_batches_where_there_is_room_and_else_by_steps():
+    scene = FakeScene(bodies=3, records=3 * (2 * BATCH + 5))
+    graphs = launched(scene)
+    scene.loop.run(2 * BATCH)
+    by_batches = sum(graph in RECORD_GRAPHS for graph in graphs)
+    assert by_batches == scene.loop.loop.finished
+    scene.loop.run(BATCH)  # there is room for five steps
+    assert sum(graph in RECORD_GRAPHS for graph in graphs) == scene.loop.loop.finished + 5
+    records = scene.loop.records()
+    assert records["step"].tolist() == np.repeat(np.arange(1, 2 * BATCH + 6), 3).tolist()
+    assert scene.loop.loop.records_dropped == 3 * (BATCH - 5)
+    scene.loop.run(BATCH)
+    records = scene.loop.records()
+    assert records["step"].tolist() == np.repeat(np.arange(3 * BATCH + 1, 4 * BATCH + 1), 3).tolist()
+    np.testing.assert_allclose(records["residual"], 1e-7 * (records["step"] - 1))
 
 
 @pytest.mark.parametrize("real", ["f4", "f8"])

@@ -15,7 +15,7 @@ from sim_server.backends.compiler import INCLUDE, SOURCES, compiler
 from sim_server.backends.gpu.momentum import FREE_BODIES, MOMENTUM, SUMS, chunks_of_blocks
 from sim_server.backends.gpu.rosenbrock import EULER, FACTOR, ITERATE, STAGE_DECISION
 from sim_server.backends.gpu.solver import PCG_BODY
-from sim_server.backends.gpu.structs import PCG_RESULT, STAGE_RESULT, STAGE_STATE
+from sim_server.backends.gpu.structs import STAGE_RESULT, STAGE_STATE
 from sim_server.backends.kinds import Kind
 
 BLOCK = 32  # items of a thread block
@@ -120,7 +120,6 @@ class Bodies:
         )
         self.clock, self.stamps, self.counters = np.zeros(1), np.zeros((2, 2), "i8"), np.zeros(5, "u4")
         self.begun = np.zeros(1, "i8")
-        self.solves = np.zeros((2, count), PCG_RESULT)
 
     def params(self, b: NDArray, attempt: int = ITERATE) -> Any:
         """Arguments of the kernels. b: in the frames of the nodes."""
@@ -130,8 +129,7 @@ class Bodies:
         end: Any = decision["end"]
         for name, array in {
             "clock": self.clock, "step": self.step, "pool_counters": self.counters, "finished_blocks": self.finished,
-            "timestamps": self.stamps, "results": self.solves, "host_results": self.solves, "moving": self.moving,
-            "begun": self.begun,
+            "timestamps": self.stamps, "moving": self.moving, "begun": self.begun,
         }.items():  # fmt: skip
             end[name] = array.ctypes.data
         end["counters"], end["capacity"], end["bodies"] = 5, 2, len(self.phase)

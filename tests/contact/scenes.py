@@ -33,6 +33,12 @@ def ram() -> dict:
     return {"name": "ram", "shape": "box", "size": [0.3, 0.02, 0.3], "friction": 0.5, "keyframes": frames}
 
 
+def thrust() -> dict:
+    """An [[obstacle]]: a ball that goes down through a block and the floor at 20 m/s, in two steps of 10 ms."""
+    frames = [{"time": 0, "translate": [0.05, 0.3, 0.05]}, {"time": 0.03, "translate": [0.05, -0.3, 0.05]}]
+    return {"name": "ball", "shape": "sphere", "radius": 0.05, "friction": 0.5, "keyframes": frames}
+
+
 def edge() -> list[dict]:
     """[[obstacle]] tables: a plate under two thirds of a block, and a floor 50 micrometres lower under the rest."""
     low = floor(pose={"translate": (0, -5e-5, 0)})

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from sim_server.simulation import Simulation
-from tests.contact.scenes import D, block, over
+from tests.contact.scenes import D, block, floor, over, thrust
 
 SMALL = {"cells": (2, 2, 2), "size": (0.1, 0.1, 0.1), "young": 3e5}
 
@@ -79,6 +79,20 @@ def test_what_is_clipped_is_counted_and_stays_outside():
     records = sim.engine.records()
     assert records["clipped"].any()
     assert (surface(sim)[:, 1] > 0).all()
+
+
+def test_a_block_that_a_ball_is_thrust_through_stays_on_the_floor_and_comes_back():
+    """The ball ends below the floor, and has no place in front of both for what it takes along."""
+    sim = over(floor(), thrust(), cells=(3, 3, 3), size=(0.1, 0.1, 0.1), young=1e5, dt=0.01, at=(0, 0.006, 0))
+    records = []
+    for _ in range(10):
+        sim.engine.run(1)
+        records.append(sim.engine.records()[0])
+        assert (surface(sim)[:, 1] > 0).all()
+    assert records[1]["clipped"] > 0 and not any(r["status"] for r in records[3:])
+    x = sim.world.x[sim.world.bodies[0].tets]
+    volume, rest = (np.linalg.det(p[:, 1:] - p[:, :1]) for p in (x, sim.world.rest[sim.world.bodies[0].tets]))
+    assert (volume > 0.9 * rest).all()
 
 
 def test_a_node_between_two_plates_that_close():

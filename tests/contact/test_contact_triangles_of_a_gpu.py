@@ -12,9 +12,10 @@ from sim_server.backends.declarations import Declarations
 from sim_server.backends.gpu.faces import DEFINED, corners_of_nodes, links_of_corners
 from sim_server.simulation import Simulation
 from tests.contact.kernels_beside import TEXT, Beside, compiled
-from tests.contact.scenes import D, block, floor, over
+from tests.contact.scenes import D, block, floor, over, thrust
 from tests.contact.test_contact_triangles import SMALL, obstacle
 
+OUT_OF_PASSES = Declarations("kernels/kinds.h").enumeration("Status")["CONTACT"]
 ROUNDS = Declarations("kernels/contact_passes.cuh").constant("ROUNDS")
 STEP = """
 extern "C" void detect(const ContactArguments* c) { each_triangle(*c, [&] { detect_faces(*c); }); }
@@ -72,11 +73,21 @@ def test_a_fast_block_gets_rows_by_the_sweep(library, monkeypatch):
 
 
 @pytest.mark.parametrize("name", ["corner", "rod"])
-def test_triangles_are_held_back_where_passes_run_out(library, monkeypatch, name):
-    short = {"thickness": D, "passes": 1, "stiffness": 0.001}
-    beside = Beside(library, thrown(name, 10.0, short, at=(0, 0.05, 0)), monkeypatch)
+@pytest.mark.parametrize(("passes", "stiffness", "rounds"), [(1, 0.001, 0), (200, 1e-6, ROUNDS)])
+def test_triangles_are_held_back_where_passes_or_rounds_run_out(library, monkeypatch, name, passes, stiffness, rounds):
+    few = {"thickness": D, "passes": passes, "stiffness": stiffness}
+    beside = Beside(library, thrown(name, 10.0, few, at=(0, 0.05, 0)), monkeypatch)
     records = [beside.compare(1e-5) for _ in range(3)]
-    assert beside.rounds == ROUNDS and max(r["clipped"] for r in records) > 0
+    assert beside.rounds == rounds and max(r["clipped"] for r in records) > 0
+
+
+def test_a_block_that_a_ball_is_thrust_through_is_held_back_alike(library, monkeypatch):
+    """Nodes that the ball takes through the floor have no place in front of both. Passes run out after a sweep."""
+    given = {"cells": (3, 3, 3), "size": (0.1, 0.1, 0.1), "young": 1e5, "dt": 0.01, "at": (0, 0.006, 0)}
+    beside = Beside(library, over(floor(), thrust(), **given, solver=TIGHT | {"tolerance": 1e-9}), monkeypatch)
+    records = [beside.compare(1e-6) for _ in range(5)]
+    assert 0 < beside.rounds < ROUNDS and max(r["clipped"] for r in records) > 0
+    assert OUT_OF_PASSES in [r["status"] for r in records]
 
 
 def test_a_copy_of_the_matrix_knows_contacts(library, monkeypatch):

@@ -176,8 +176,8 @@ def test_it_is_told_once_and_counted():
     lines = []
     for _ in range(4):
         records = driver.advance(6)
-        lines += telemetry.halved(records)
-        telemetry.update_summary(records)
+        lines += telemetry.warnings.halved(records)
+        telemetry.summary.update(records)
     telemetry.publish_status("running")
     assert len(lines) == 1 and lines[0].startswith("object 'bar', step 7: ran away; made again by ")
     events = {e.event: e.steps for e in found[0].objects[0].events}

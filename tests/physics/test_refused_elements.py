@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from protocol.messages_pb2 import SolveStatus
-from sim_server.service.telemetry import not_finite_lines
+from sim_server.service.step_warnings import not_finite_lines
 from sim_server.updates.driver import Driver
 from tests.physics.laws import LAWS, Law, determinants, forces, law_bar, stiffness
 

@@ -167,8 +167,8 @@ def lines_and_status(on_runaway: str) -> tuple[list[str], pb.Status, Driver]:
     sim.engine.loop.energy_every = 2
     for _ in range(5):
         records = driver.advance(7)
-        lines += [*telemetry.count_unconverged(records), *telemetry.count_runaways(records)]
-        telemetry.update_summary(records)
+        lines += [*telemetry.warnings.count_unconverged(records), *telemetry.warnings.count_runaways(records)]
+        telemetry.summary.update(records)
     telemetry.publish_status("running")
     return lines, found[0], driver
 

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Slots of shared memory, seen by zenoh, by their owner and by a borrower."""
 
+import threading
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +10,8 @@ import pytest
 from protocol.messages_pb2 import Slot as SlotMessage
 from protocol.refused import Refused
 from protocol.shared_memory import limits as shm_limits
-from protocol.shared_memory.pool import HEADER, Slot, SlotPool
+from protocol.shared_memory import pool as module
+from protocol.shared_memory.pool import HEADER, LARGE, Slot, SlotPool, SlotsUnusable
 from protocol.shared_memory.view import SlotMap
 
 pytestmark = pytest.mark.skipif(bool(shm_limits.obstacle()), reason=f"no shared memory here: {shm_limits.obstacle()}")
@@ -45,6 +47,49 @@ def test_a_slot_is_used_again_in_a_new_generation(pool: SlotPool) -> None:
     again = pool.lend(99_000)
     assert again is first and again.message().generation == late.generation + 1
     assert not borrower.is_current(late) and borrower.is_current(again.message())
+
+
+def test_a_large_slot_is_made_beside_those_who_do_not_wait(monkeypatch: pytest.MonkeyPatch) -> None:
+    """And while it is, other slots are lent, and its bytes count."""
+    pool, go = SlotPool(limit=24 << 20), threading.Event()
+    made: list[threading.Thread] = []
+
+    class Slow(Slot):
+        def __init__(self, capacity: int):
+            if capacity > LARGE:
+                made.append(threading.current_thread())
+                assert go.wait(60)
+            super().__init__(capacity)
+
+    monkeypatch.setattr(module, "Slot", Slow)
+    size = 6 << 20
+    assert pool.lend(size, beside=True) is None and pool.is_making(size) and not pool.is_making(size // 8)
+    assert pool.lend(size, beside=True) is None, "and none besides"
+    small = pool.lend(8000, beside=True)
+    assert small is not None and pool.bytes >= size
+    assert pool.lend(20 << 20) is None, "there is no room beside it"
+    go.set()
+    while pool.is_making(size):
+        pool.lend(8000)
+    slot = pool.lend(size, beside=True)
+    assert slot is not None and slot.capacity >= size
+    assert len(made) == 1 and made[0] is not threading.current_thread()
+    pool.close()
+
+
+def test_what_cannot_be_made_is_made_by_who_waits(pool: SlotPool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """And a pool is closed while one is made."""
+
+    def refused(capacity: int) -> Slot:
+        raise SlotsUnusable("not now")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(module, "Slot", refused)
+        pool.prepare(6 << 20)
+        while pool.is_making(6 << 20):
+            pool.lend(8)
+    assert pool.lend(6 << 20) is not None
+    pool.prepare(7 << 20)
 
 
 def test_a_slot_given_back_twice_is_lent_once(pool: SlotPool) -> None:

@@ -26,10 +26,11 @@ from protocol.network.identity import identity_of
 from protocol.network.session import open_session
 from sim_server.certificates.in_use import Certificates
 from sim_server.errors import InputError
-from sim_server.network import dispatch
+from sim_server.network import job_sender
 from sim_server.network.factor_fetch import FactorFetch
 from sim_server.network.link import ServerLink
-from tests.system.link_helpers import DenseAnalysis, Driver, chain, dense, free_endpoint, matrix, product
+from tests.ports import free_endpoint
+from tests.system.link_helpers import DenseAnalysis, Driver, chain, dense, matrix, product
 from tests.system.server_process import PATIENCE, Stage, beam, run, until
 
 pytestmark = pytest.mark.system
@@ -247,7 +248,7 @@ def test_certificates_of_others_do_not_serve(stage: TlsStage, name: str) -> None
 
 
 def test_parts_of_a_factor_pass_the_rules(stage: TlsStage, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(dispatch, "PART_BYTES", 64)
+    monkeypatch.setattr(job_sender, "PART_BYTES", 64)
     where, topology, ended = free_endpoint().replace("tcp/", "tls/"), chain(), threading.Event()
     with (
         ServerLink(listen=[where], shared_memory=False, tls=identity_of(stage.certs, ("server",))) as link,

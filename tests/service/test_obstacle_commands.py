@@ -154,7 +154,7 @@ def test_what_contact_leaves_undone_is_said_once_for_each_object(monkeypatch: py
     assert line.startswith("object 'cube', step 2: 2 nodes would have passed into an obstacle")
     assert telemetry.contact.count_clipped(records) == [] and telemetry.contact.clipped[0] == 14
     records["status"][2], records["contact_residual"][2] = pb.CONTACT, 0.25
-    assert "not converged (contact, residual 2.5e-01)" in telemetry.count_unconverged(records)[0]
+    assert "not converged (contact, residual 2.5e-01)" in telemetry.warnings.count_unconverged(records)[0]
     assert sim.contact is not None
     sim.contact.dropped[7:9] = 1, 4
     assert "more obstacles or objects near" in telemetry.contact.crowded_nodes()[0]

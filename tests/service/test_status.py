@@ -50,16 +50,16 @@ def test_what_goes_wrong_is_counted_by_object_and_shown():
     sim, found = simulation(bar(young=1e5), gravity=(0, -9.81, 0), max_iterations=1), []
     driver = Driver(sim)
     telemetry = Telemetry(driver, SimpleNamespace(publish_status=found.append), None, patient=False)  # type: ignore[arg-type]
-    telemetry.update_summary(driver.advance(3))
+    telemetry.summary.update(driver.advance(3))
     sim.world.v[:] = np.nan
-    telemetry.update_summary(driver.advance(1))
+    telemetry.summary.update(driver.advance(1))
     telemetry.publish_status("running")
     counts = {e.event: e.steps for e in found[0].objects[0].events}
     assert counts == {"max_iterations": 3, "not_finite": 1}
     text = io.StringIO()
     Console(width=200, file=text).print(tables(found[0]))
     assert "max_iterations 3, not_finite 1" in text.getvalue()
-    telemetry.events.clear(0)
+    telemetry.summary.events.clear(0)
     telemetry.publish_status("running")
     assert not found[1].objects[0].events
 
@@ -123,14 +123,14 @@ def test_very_many_explicit_substeps_are_told_once_while_the_first_step_is_made(
     body = bar((1, 1, 1), (0.01, 0.01, 0.01), young=1e9, fixed="X < 1e-4")
     sim = simulation(body, dt=1.0, integrator={"scheme": "central_difference"})
     telemetry = Telemetry(Driver(sim), SimpleNamespace(), None, patient=False)  # type: ignore[arg-type]
-    assert telemetry.many_substeps() == []  # not known yet
+    assert telemetry.warnings.many_substeps() == []  # not known yet
     step, told = Thread(target=sim.engine.run, args=(1,)), []
     step.start()
     while not told and step.is_alive():
-        told = telemetry.many_substeps()
+        told = telemetry.warnings.many_substeps()
     assert sim.engine.step == 0, "told after the step"
     assert len(told) == 1 and f"{sim.engine.substeps:,} explicit substeps" in told[0]
-    assert telemetry.many_substeps() == []
+    assert telemetry.warnings.many_substeps() == []
     sim.engine.loop.stop = 1
     step.join()
     assert sim.engine.records()["substeps"][0] == sim.engine.substeps > 100_000
@@ -140,7 +140,7 @@ def test_few_explicit_substeps_are_not_told():
     sim = simulation(bar(fixed="X < 0.01"), integrator={"scheme": "central_difference"})
     telemetry = Telemetry(Driver(sim), SimpleNamespace(), None, patient=False)  # type: ignore[arg-type]
     sim.engine.run(2)
-    assert sim.engine.substeps > 0 and telemetry.many_substeps() == []
+    assert sim.engine.substeps > 0 and telemetry.warnings.many_substeps() == []
 
 
 def test_energy_from_nowhere_is_told_once_though_the_body_hardly_moves():
@@ -156,6 +156,6 @@ def test_energy_from_nowhere_is_told_once_though_the_body_hardly_moves():
         case.act(sim, step)
         sim.engine.run(1)
         records = sim.engine.records()
-        told += [(step, line) for line in telemetry.gained_energy(records)]
+        told += [(step, line) for line in telemetry.warnings.gained_energy(records)]
         assert records["status"][0] == pb.CONVERGED
     assert len(told) == 1 and told[0][0] > 15 and "kinetic and elastic" in told[0][1]

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from hand_worker import HandWorker
-from link_helpers import DenseAnalysis, Driver, chain, dense, free_endpoint, light_worker, matrix, product
+from link_helpers import DenseAnalysis, Driver, chain, dense, light_worker, matrix, product
 from zenoh.handlers import RingChannel
 
 from protocol.channels import key
@@ -18,9 +18,10 @@ from protocol.messages_pb2 import FactorBatch, MatrixBatch
 from protocol.shared_memory.limits import obstacle
 from protocol.shared_memory.view import SlotMap
 from protocol.validate import checksum
-from sim_server.network import dispatch
+from sim_server.network import factor_intake, job_sender, worker_choice
 from sim_server.network.link import ServerLink
 from sim_server.updates.factor_source import Job
+from tests.ports import free_endpoint
 
 pytestmark = [
     pytest.mark.system,
@@ -114,7 +115,7 @@ class Hand:
 @pytest.fixture(scope="module")
 def stage() -> Iterator[Hand]:
     patch = pytest.MonkeyPatch()
-    patch.setattr(dispatch, "QUEUE_SECONDS", 60.0)
+    patch.setattr(worker_choice, "QUEUE_SECONDS", 60.0)
     endpoint = free_endpoint()
     with (
         ServerLink(listen=[endpoint], silence=600) as link,
@@ -198,41 +199,36 @@ def field(name: str, value: Any) -> Spoil:
     return spoil
 
 
-# What is wrong with the second of four answers, and how it is refused. Those of the others count.
-ONE: dict[str, tuple[str, Spoil]] = {
+# What is wrong with the second of four answers, in the message or the first value of its factor, and how it is refused.
+ONE: dict[str, tuple[str, Spoil | float]] = {
     "checksum": ("checksum", field("checksums", 7)),
     "pattern never sent": ("pattern", field("patterns", 7)),
     "size": ("shape", field("nonzeros", 2**62)),
     "NaN seconds": ("malformed", field("seconds", math.nan)),
     "negative seconds": ("malformed", field("seconds", -1.0)),
+    "NaN": ("not_finite", math.nan),
+    "negative diagonal": ("not_positive", -1.0),
 }
 
 
 @pytest.mark.parametrize("name", ONE)
 def test_what_is_wrong_with_one_costs_the_others_nothing(stage: Hand, name: str) -> None:
-    kind, spoil = ONE[name]
+    kind, wrong = ONE[name]
+
+    def edit(place: int, values: np.ndarray) -> np.ndarray:
+        if place == 1 and isinstance(wrong, float):
+            values[0] = wrong
+        return values
+
     batch, before = stage.batch(), stage.driver.link.counters.refusals[kind]
-    message = stage.answer(batch)
-    spoil(message)
+    message = stage.answer(batch, edit=edit)
+    if callable(wrong):
+        wrong(message)
     stage.send(message)
     stage.driver.until(lambda: all_are_back(stage), "the answers")
     stage.check_factors()
     assert stage.made() == {"a", "c", "d"} and stage.failed() == {"b"}
     assert stage.driver.link.counters.refusals[kind] == before + 1 and stage.driver.link.slots_lent == 0
-
-
-@pytest.mark.parametrize(("value", "kind"), [(math.nan, "not_finite"), (-1.0, "not_positive")])
-def test_bad_values_of_one_cost_the_others_nothing(stage: Hand, value: float, kind: str) -> None:
-    def edit(place: int, values: np.ndarray) -> np.ndarray:
-        if place == 2:
-            values[0] = value
-        return values
-
-    batch, before = stage.batch(), stage.driver.link.counters.refusals[kind]
-    stage.send(stage.answer(batch, edit=edit))
-    stage.driver.until(lambda: all_are_back(stage), "the answers")
-    assert stage.made() == {"a", "b", "d"} and stage.failed() == {"c"}
-    assert stage.driver.link.counters.refusals[kind] == before + 1
 
 
 def test_a_failed_job_is_told_with_its_reason(stage: Hand) -> None:
@@ -288,7 +284,7 @@ def test_answers_of_no_job_and_second_answers_are_refused_one_by_one(stage: Hand
 
 def test_large_batches_are_decoded_beside_the_caller(stage: Hand, monkeypatch: pytest.MonkeyPatch) -> None:
     """All count as large here. Meanwhile nothing is taken and second answers are refused; then each counts alone."""
-    monkeypatch.setattr(dispatch, "LARGE", 0)
+    monkeypatch.setattr(factor_intake, "LARGE", 0)
     batch, go = stage.batch(), threading.Event()
     decode, before = stage.driver.link.dispatch.decoder.decode_one, stage.driver.link.counters.refusals["duplicate"]
 
@@ -316,8 +312,8 @@ def test_what_waits_behind_a_first_job_has_longer(stage: Hand) -> None:
     stage.driver.submit(new, 1)
     batch = stage.batch()
     leases = {job.object: job.deadline - job.sent_at for job in stage.driver.link.dispatch.leases.jobs}
-    assert {name: round(leases[name]) for name in NAMES} == dict.fromkeys(NAMES, round(dispatch.BEHIND))
-    assert leases["new"] > 2 * dispatch.BEHIND, "but not as long: a message may be lost"
+    assert {name: round(leases[name]) for name in NAMES} == dict.fromkeys(NAMES, round(job_sender.BEHIND))
+    assert leases["new"] > 2 * job_sender.BEHIND, "but not as long: a message may be lost"
     answer, values = stage.hand.right_answer(stage.hand.receive(), new)
     stage.hand.answer(answer, values)
     stage.send(stage.answer(batch))
@@ -360,7 +356,7 @@ def test_a_worker_of_an_older_version_gets_them_one_by_one(stage: Hand) -> None:
 
 def test_a_real_worker_answers_batches(monkeypatch: pytest.MonkeyPatch) -> None:
     """Twelve objects of three sizes, forty rounds: each factor is that of its own matrix."""
-    monkeypatch.setattr(dispatch, "QUEUE_SECONDS", 60.0)
+    monkeypatch.setattr(worker_choice, "QUEUE_SECONDS", 60.0)
     endpoint, names = free_endpoint(), [f"beam{k}" for k in range(12)]
     beams = [chain(5 + k % 3, name) for k, name in enumerate(names)]
     with ServerLink(listen=[endpoint]) as link, light_worker(endpoint):

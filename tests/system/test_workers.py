@@ -15,16 +15,17 @@ import numpy as np
 import pytest
 import zenoh
 from hand_worker import HandWorker
-from link_helpers import Driver, chain, dense, free_endpoint, light_worker, matrix, process, product
+from link_helpers import Driver, chain, dense, light_worker, matrix, process, product
 
 from protocol import messages_pb2 as pb
 from protocol.refused import Refused
 from protocol.shared_memory import limits as shm_limits
 from protocol.shared_memory import probe as shm_probe
 from protocol.shared_memory.pool import Slot
-from sim_server.network import dispatch
+from sim_server.network import factor_intake, worker_choice
 from sim_server.network.link import ServerLink
 from sim_server.updates.factor_source import Job
+from tests.ports import free_endpoint
 
 pytestmark = pytest.mark.system
 shared = pytest.mark.skipif(bool(shm_limits.obstacle()), reason=f"no shared memory here: {shm_limits.obstacle()}")
@@ -60,7 +61,7 @@ def test_matrices_and_factors_go_through_shared_memory() -> None:
 @shared
 def test_several_small_objects_wait_at_one_worker(monkeypatch: pytest.MonkeyPatch) -> None:
     """Jobs of all of them are in flight at once, and each factor is that of its own matrix."""
-    monkeypatch.setattr(dispatch, "QUEUE_SECONDS", 60.0)
+    monkeypatch.setattr(worker_choice, "QUEUE_SECONDS", 60.0)
     endpoint, names = free_endpoint(), [f"beam{k}" for k in range(12)]
     beams = [chain(object=name) for name in names]
     with ServerLink(listen=[endpoint]) as link, light_worker(endpoint):
@@ -83,7 +84,7 @@ def test_several_small_objects_wait_at_one_worker(monkeypatch: pytest.MonkeyPatc
 
 def test_large_factors_are_decoded_beside_the_caller(monkeypatch: pytest.MonkeyPatch) -> None:
     """All count as large here; while one is decoded, a second answer to its job is refused."""
-    monkeypatch.setattr(dispatch, "LARGE", 0)
+    monkeypatch.setattr(factor_intake, "LARGE", 0)
     endpoint = free_endpoint()
     with ServerLink(listen=[endpoint]) as link, HandWorker(endpoint, link.incarnation) as hand:
         driver = Driver(link)

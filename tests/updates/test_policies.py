@@ -305,6 +305,27 @@ def test_bound_of_the_age_by_policy(update, bound):
     assert update == "never" or driver.bodies[0].solves.max_factor_age <= driver.age_bound()
 
 
+class Fluctuating(Inline):
+    """A worker that is there every second time that somebody asks."""
+
+    asked = 0
+
+    def worker_count(self) -> int:
+        self.asked += 1
+        return self.asked % 2
+
+
+@pytest.mark.parametrize("asked", [0, 1])
+def test_a_worker_that_joins_or_leaves_while_the_bound_is_reckoned_changes_nothing(asked):
+    sim = falling(update="async")
+    driver = Driver(sim, source := Fluctuating(patterns_of(sim)))
+    driver.advance(8)
+    assert np.isfinite(driver.table.latency).all()
+    source.asked = asked
+    bound = driver.age_bound()
+    assert bound > 0 if asked == 0 else bound == -1
+
+
 def adaptive(gravity: float, steps: int, **solver) -> tuple[Driver, NDArray]:
     """A beam, one worker in virtual time: costs in bytes and operations."""
     beam = bar((6, 3, 3), (4, 1, 1), young=2e5, fixed="X < 0.01")

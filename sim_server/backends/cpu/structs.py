@@ -6,7 +6,7 @@ import ctypes as c
 from sim_server.backends.declarations import Declarations
 
 LOOP = Declarations("backends/cpu/native/loop.h")
-RECORD = LOOP.dtype("Record")  # one body, one step: native/ring_buffers.h
+RECORD = LOOP.dtype("Record")  # one body, one step: kernels/step_record.cuh
 REACTION = LOOP.dtype("Reaction")  # of a body on a grab or on another body: kernels/reaction.h
 REACTION_KINDS = LOOP.enumeration("ReactionKind")
 CHANGE = LOOP.dtype("Change")  # of a diagonal entry: native/woodbury.h

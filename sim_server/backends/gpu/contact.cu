@@ -243,7 +243,7 @@ extern "C" __global__ void __launch_bounds__(CONTACT_THREADS) contact_search(con
         if (phase == SOLVED && n.pair >= 0) look_for_touch(c, n, y, sum);
         if (phase == PASSED) project(c, n, here.body, y, sum);
         if (phase == LAST_PASSED) evaluate_end(c, n, here.body, y, sum);
-        if (phase >= LAST_PASSED && n.pair >= 0 && state.rounds < ROUNDS) sum[3] += sweep(c, n, y);
+        if (phase >= LAST_PASSED && n.pair >= 0 && gives_rows(state.rounds, state.passes, c.passes)) sum[3] += sweep(c, n, y);
     }
     if (!sum_body(c, here, sum)) return;
     if (FACES && phase == SOLVED) sum[0] += c.faces.counted[here.body];
@@ -357,7 +357,7 @@ extern "C" __global__ void __launch_bounds__(CONTACT_THREADS) finish_contact(con
         const SurfaceNode n = SurfaceNode::at(c, i);
         if (c.spring || c.blocks_then) keep_for_factors(c, i);
         if (n.pair >= 0) {
-            if (well) sum[2] += clip(c, n);
+            if (well && !(FACES && is_held_back(c, state))) sum[2] += clip(c, n);  // else finish_faces has done so
             keep_forces(c, n, well, sum);
             for (int k = 0; k < 9; ++k) c.values[9ll * c.place[i] + k] = c.known[9ll * (n.pair / 2) + k];  // copies are made after the step
             if (has_faces(c, n, body)) give_links(c, n, c.faces.known);

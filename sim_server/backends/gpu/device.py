@@ -7,6 +7,7 @@ device array of a host array, which it makes and fills at the first call.
 
 import hashlib
 from collections.abc import Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from copy import copy
 from functools import cache
@@ -210,6 +211,7 @@ class Gpu:
         self._twins: dict[int, tuple[NDArray[Any], DeviceArray]] = {}
         self._kept: dict[int, tuple[NDArray[Any], np.dtype | None]] = {}  # keeping an array keeps its id its own
         self._modules: dict[str, DeviceModule] = {}
+        self._device, self._fetching = self.cp.cuda.Device(), ThreadPoolExecutor(1, "copies")
         self.properties = self.cp.cuda.runtime.getDeviceProperties(self.cp.cuda.Device().id)
 
     def twin(self, host: NDArray[Any], keep: bool = True, dtype: np.dtype | None = None) -> DeviceArray:
@@ -244,6 +246,16 @@ class Gpu:
         if id(host) in self._twins:
             host[...] = self.twin(host).get()
         return host
+
+    def begin_fetch(self, host: NDArray[Any]) -> Future[NDArray[Any]]:
+        """Begins to copy the twin of an array in a thread; the array of the host does not change."""
+
+        def copied() -> NDArray[Any]:
+            self._device.use()  # the current device is one of each thread
+            found: NDArray[Any] = self._twins[id(host)][1].get() if id(host) in self._twins else host
+            return found.astype(host.dtype, copy=False)
+
+        return self._fetching.submit(copied)
 
     def push(self, host: NDArray[Any]) -> None:
         """Copies the host array into its twin."""

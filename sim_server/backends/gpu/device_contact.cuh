@@ -372,24 +372,34 @@ __device__ bool sweep(const ContactArguments& c, const SurfaceNode& n, const dou
     return found;
 }
 
+// True if what y still takes into obstacles is held back, of a body whose solves are over.
+__device__ __forceinline__ bool is_held_back(const ContactArguments& c, const ContactState& state) {
+    return !gives_rows(state.rounds, state.passes, c.passes);
+}
+
+// Of first_entered.
+__device__ __forceinline__ auto entry_of(const ContactArguments& c) {
+    return [&t = c.obstacles](int obstacle, const double* from, const double* to, double* begin, double* end) {
+        return entry(t, obstacle, 0, from, to, begin, end);
+    };
+}
+
+// Moves a point to a place at the end of the step.
+__device__ __forceinline__ void put_at(const ContactArguments& c, const SurfaceNode& n, const double* from, const double* to) {
+    double dv[3], y[3];
+    for (int k = 0; k < 3; ++k) dv[k] = (to[k] - from[k]) / c.dx_dv - (double)c.predictor[3ll * n.node + k];
+    n.to_material(dv, y);
+    for (int k = 0; k < 3; ++k) c.y[3ll * n.node + k] = (real)y[k];
+}
+
 // Sets a point that y moves into an obstacle back, to a part of the way. Returns whether it does.
 __device__ bool clip(const ContactArguments& c, const SurfaceNode& n) {
-    double y[3], from[3], to[3], begin[3], end[3], back[3], earliest = NEVER;
+    double y[3], from[3], to[3], back[3];
     load3(c.y, n.node, y);
     load3(c.x, n.node, from);
     n.displacement(c, y, to);
     for (int k = 0; k < 3; ++k) to[k] += from[k];
-    for (int o = 0; o < c.obstacle_count; ++o) {
-        const double t = entry(c.obstacles, o, 0, from, to, begin, end);
-        if (t > 1 || t >= earliest) continue;
-        earliest = t;
-        for (int k = 0; k < 3; ++k) back[k] = begin[k] + SHORT_OF * t * (end[k] - begin[k]);
-        world_point(c.obstacles.end + 7 * o, back, back);
-    }
-    if (earliest > 1) return false;
-    double dv[3];
-    for (int k = 0; k < 3; ++k) dv[k] = (back[k] - from[k]) / c.dx_dv - (double)c.predictor[3ll * n.node + k];
-    n.to_material(dv, y);
-    for (int k = 0; k < 3; ++k) c.y[3ll * n.node + k] = (real)y[k];
+    if (!place_in_front(c.obstacles, c.obstacle_count, from, to, back, entry_of(c))) return false;
+    put_at(c, n, from, back);
     return true;
 }

@@ -12,7 +12,7 @@ struct ElasticEnergy {
     double* sum;                 // (bodies,) over the effects so far [J]
     const long long* step;       // (1,) completed
     Balance* balance;            // (bodies,)
-    EnergyRecord* records;       // (capacity, bodies) on the host
+    EnergyRecord* records;       // (capacity, bodies)
     int capacity, first_effect;  // 1: the first effect
 };
 

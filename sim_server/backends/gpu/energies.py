@@ -35,17 +35,19 @@ ELASTIC_ENERGY, ELASTIC_WORK = ELASTIC_TEXT.dtype("ElasticEnergy"), ELASTIC_TEXT
 class DeviceEnergies:
     """Energies of the bodies of a scene on the device.
 
-    records: host memory (capacity, bodies) of ENERGY_RECORD that the device writes to
+    capacity: steps whose records are kept
     counter: device array (1,), number of completed steps
 
+    records: device ring (capacity, bodies) of ENERGY_RECORD
     prologue: energy balance of the last step, for additional thread blocks of the first kernel of the next step
     threads: of these thread blocks; the order of summation depends on it
     """
 
-    def __init__(self, gpu: Gpu, energies: Energies, records: NDArray[np.uint8], counter: DeviceArray, dt: float):
+    def __init__(self, gpu: Gpu, energies: Energies, capacity: int, counter: DeviceArray, dt: float):
         self._gpu, self._energies, self._dt, self._counter = gpu, energies, dt, counter
         cp, e, bodies = gpu.cp, energies, len(energies.starts) - 1
-        self._bodies, self._capacity = bodies, records.nbytes // ENERGY_RECORD.itemsize // bodies
+        self._bodies, self._capacity = bodies, capacity
+        self.records: DeviceArray = cp.zeros(capacity * bodies * ENERGY_RECORD.itemsize, np.uint8)
         self.threads, self.started = THREADS, False
         chunks = node_chunks(e.starts, NODES)
         self._balance = cp.asarray(np.frombuffer(e.balance.tobytes(), np.uint8))
@@ -64,13 +66,13 @@ class DeviceEnergies:
         still = [gpu.twin(array) for array in e.still]
         self._params["still"][: len(still)] = [array.data.ptr for array in still]
         self._memory |= {f"still{k}": array for k, array in enumerate(still)}
-        self._params["records"], self._params["capacity"] = records.ctypes.data, self._capacity
+        self._params["records"], self._params["capacity"] = self.records.data.ptr, self._capacity
         self._params["bodies"], self._params["inertia"] = self._bodies, e.inertia
         self._params["on_runaway"] = CODES[e.on_runaway]
         self.prologue = Prologue(BALANCE_TEXT.checked(), "EnergyBalance", "balance_energy", self._params, len(chunks))
         self._balance_kernel = self._kernel(BALANCE_TEXT, "energy_balance")
         self._elastic_kernels = dict[np.dtype, KernelFunction]()  # by the type of the energies of an effect's elements
-        self._launches = self._elastic(records)
+        self._launches = self._elastic()
 
     def _kernel(self, text: Declarations, name: str, types: dict[str, str] | None = None) -> KernelFunction:
         """Compiles the kernel of the text <name>.cu. types: of `real` and `local`, if other than the scene's"""
@@ -78,7 +80,7 @@ class DeviceEnergies:
         module = self._gpu.cp.RawModule(code=text.checked(), options=flags, backend="nvrtc")
         return compiled(f"{name}.cu", module, name)
 
-    def _elastic(self, records: NDArray[np.uint8]) -> list[tuple[DeviceLaunch | None, DeviceArray, NDArray[Any]]]:
+    def _elastic(self) -> list[tuple[DeviceLaunch | None, DeviceArray, NDArray[Any]]]:
         """Returns per effect the launch that evaluates the element energies, their array, and arguments of the sum."""
         cp = self._gpu.cp
         found = [(e.launch, e.launch.arrays["energy"], self._energies.parts(e)) for e in self._energies.elastic]
@@ -89,7 +91,8 @@ class DeviceEnergies:
             self._memory[f"parts{k}"] = kept
             params["energy"], params["first_element"], params["sum"] = array.data.ptr, kept.data.ptr, self._sum.data.ptr
             params["step"], params["balance"] = self._counter.data.ptr, self._balance.data.ptr
-            params["records"], params["capacity"], params["first_effect"] = records.ctypes.data, self._capacity, k == 0
+            params["records"], params["capacity"] = self.records.data.ptr, self._capacity
+            params["first_effect"] = k == 0
             if array.dtype not in self._elastic_kernels:
                 types = types_of_energies(self._gpu.types, array.dtype)
                 self._elastic_kernels[array.dtype] = self._kernel(ELASTIC_TEXT, "elastic_energy", types)

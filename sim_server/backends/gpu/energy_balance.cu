@@ -25,7 +25,7 @@ struct EnergyBalance {
     real* free;                 // (n,) set to 0 where a body is frozen
     const real* gravity;        // (3,) [m/s2]
     Balance* balance;           // (bodies,)
-    EnergyRecord* records;      // (capacity, bodies) on the host
+    EnergyRecord* records;      // (capacity, bodies)
     const long long* step;      // (1,) completed
     long long* settled_step;    // (bodies,) step that was settled last
     int bodies, capacity, on_runaway, inertia;

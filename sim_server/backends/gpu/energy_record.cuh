@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: MIT
-// Energy record of a body, written to host memory (energy_balance.cu, elastic_energy.cu).
+// Energies of a body after a step (energy_balance.cu, elastic_energy.cu), of which step_records.cu makes its record.
 #pragma once
 #include "energy_balance.cuh"
 

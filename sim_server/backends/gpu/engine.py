@@ -8,6 +8,7 @@ settings, factors and arguments.
 
 import time
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any, cast
 
 import numpy as np
@@ -28,17 +29,18 @@ from sim_server.backends.gpu.energies import DeviceEnergies
 from sim_server.backends.gpu.factor_upload import FactorUpload
 from sim_server.backends.gpu.held import HeldForces, leading
 from sim_server.backends.gpu.kernel_fusion import DOMAINS, Epilogue, FusedKernel, Prologue, fuse
+from sim_server.backends.gpu.known_patterns import KnownPatterns
 from sim_server.backends.gpu.loop import CAPACITY, MANY, DeviceLoop
 from sim_server.backends.gpu.mailbox import ChangeMailbox, DeviceMailbox
 from sim_server.backends.gpu.measured import MeasuredReport
 from sim_server.backends.gpu.newton import NewtonIteration, NewtonPhases, begins_beside
 from sim_server.backends.gpu.rosenbrock import ATTEMPTS, RosenbrockStep
-from sim_server.backends.gpu.solver import PCG_BODY, PCG_RESULT, SETTINGS_BYTES, PcgSolver
+from sim_server.backends.gpu.solver import PCG_BODY, SETTINGS_BYTES, PcgSolver
 from sim_server.backends.gpu.splits import DeviceSplits, Staged
 from sim_server.backends.gpu.state import device_array, device_arrays
+from sim_server.backends.gpu.step_records import StepRecords
 from sim_server.backends.gpu.structs import (
     CONTACT_RESULT,
-    ENERGY_RECORD,
     NEWTON_RESULT,
     PAIR_SUM,
     STAGE_RESULT,
@@ -108,9 +110,7 @@ class GpuEngine(DeviceLoop):
         self._steps = device.step_stream
         self._counter: DeviceArray = cp.zeros(1, np.int64)  # completed steps
         self._timestamps = device.pinned(CAPACITY * STEP_TIMESTAMP.itemsize)
-        self._results = device.pinned(CAPACITY * PCG_RESULT.itemsize * bodies)
-        energy_records = device.pinned(CAPACITY * ENERGY_RECORD.itemsize * bodies)
-        self._energies = DeviceEnergies(gpu, given.energies, energy_records, self._counter, dt)
+        self._energies = DeviceEnergies(gpu, given.energies, CAPACITY, self._counter, dt)
         alone = stages is not None and stages.factor_alone
         detection = (
             [x for x in assemble if x.domain not in DOMAINS] if given.contact else []
@@ -195,14 +195,16 @@ class GpuEngine(DeviceLoop):
             addresses["poses"] = self._contact.poses
         stage_results = device.pinned(CAPACITY * STAGE_RESULT.itemsize * bodies) if stages else None
         super().__init__(
-            device, ranges, arrays["row_start"], dt, mailboxes, self._results, self._timestamps, arrays["clock"],
-            records, twins["values"].dtype, newton_results, energy_records, stage_results,
+            device, ranges, arrays["row_start"], dt, mailboxes, self._timestamps, arrays["clock"],
+            records, twins["values"].dtype, newton_results, stage_results,
             contact_results, reactions, held, substep_results, most_blocks, **addresses,
         )  # fmt: skip
         if told:
             self.report_pairs(*told)
         if measured is not None:
             self.report_measured(given.measured, measured)
+        kept = () if most_blocks else ranges  # patterns of what is split change
+        self._patterns = KnownPatterns(self.solver, kept, arrays["row_start"], arrays["columns"])
         self._factor_upload = FactorUpload(gpu, self.solver, self, given.names, self.mailboxes[bodies : 2 * bodies])
         for k in range(bodies):
             whole = self.solver.bodies[k : k + 1].tobytes()
@@ -238,14 +240,13 @@ class GpuEngine(DeviceLoop):
         arrays = {
             "clock": self.gpu.twin(self._arrays["clock"]), "step": self._counter,
             "pool_counters": self.solver.pool_counter, "finished_blocks": self._finished_blocks,
-            "results": self.solver.results, "moving": self.gpu.twin(self._arrays["moving"]),
-            "begun": self.solver.begun,
+            "moving": self.gpu.twin(self._arrays["moving"]), "begun": self.solver.begun,
         }  # fmt: skip
         for name, array in arrays.items():
             params[name] = array.data.ptr
-        params["timestamps"], params["host_results"] = self._timestamps.ctypes.data, self._results.ctypes.data
+        params["timestamps"] = self._timestamps.ctypes.data
         params["dt"], params["counters"], params["capacity"] = dt, len(self.solver.pool_counter), CAPACITY
-        params["result_words"], params["bodies"] = len(self._ranges) * PCG_RESULT.itemsize // 8, len(self._ranges)
+        params["bodies"] = len(self._ranges)
         return params
 
     # --- running ------------------------------------------------------------------------------------------------
@@ -307,7 +308,7 @@ class GpuEngine(DeviceLoop):
         self._energies.started = False
 
     def _capture(self) -> None:
-        """Captures the graphs of the steps and of the energies."""
+        """Captures the graphs of the steps, of the energies and of the records."""
         many = self._newton is None or self._newton.loops or self._newton.rounds <= FEW
         for begin in (False, True):
             for steps in (1, MANY):
@@ -324,9 +325,11 @@ class GpuEngine(DeviceLoop):
         others = [self._captured(self._energies.launch_balance), self._captured(self._energies.launch_elastic)]
         if self._matrix:
             others.append(self._captured(self._assemble_matrix))
+        writer = StepRecords(self.gpu, self.solver.results, self._energies.records, CAPACITY, self.loop)
+        records = [self._captured(partial(self._report, writer, target)) for target in self.targets]
         handles = [int(graph.graphExec) if graph else 0 for graph in self._graphs]
-        self.use_graphs(handles, *(int(graph.graphExec) for graph in others))
-        self._graphs += others  # kept as long as the engine
+        self.use_graphs(handles, [int(g.graphExec) for g in records], *(int(graph.graphExec) for graph in others))
+        self._graphs += [*others, *records]  # kept as long as the engine
         self._second_half = None
         if self.stages or self._contact or self._substeps or (self._newton and self._newton.loops):
             self._second_half = self._captured(self._finish_step)
@@ -349,6 +352,12 @@ class GpuEngine(DeviceLoop):
             self._steps.begin_capture()
             launch()
             return self._steps.end_capture()
+
+    def _report(self, records: StepRecords, target: int) -> None:
+        """Appends what ends a batch: the energy balance of its last step, the others' are part of the next step's first
+        kernel, and the records."""
+        self._energies.launch_balance()
+        records.launch(target)
 
     def _begin(self) -> None:
         """Launches the kernel that writes the time at which the step begins, for an idle device."""
@@ -464,12 +473,15 @@ class GpuEngine(DeviceLoop):
         )
 
     def prepare_for_factors(self) -> None:
-        """Has the kernels that build inverses of factors compiled beside the caller."""
+        """Has the kernels that build inverses of factors compiled beside the caller, and the inverses planned whose
+        patterns are known from earlier runs."""
         self.solver.compile_builder()
+        self._patterns.plan()
 
     def expect_factors(self, body: int, pattern: FactorPattern) -> None:
         """Begins to plan the inverses of factors of a pattern that will come, beside the caller."""
         self._factor_upload.expect(body, pattern)
+        self._patterns.note(body, pattern)
 
     def resume_factor(self, body: int, pattern: FactorPattern, values: NDArray[Any], step: int) -> None:
         """Posts the factor that was in use when the state was saved."""

@@ -130,7 +130,7 @@ extern "C" __global__ void __launch_bounds__(CONTACT_THREADS) sweep_faces(const 
     if (i >= c.faces.start[c.count] - c.faces.start[0]) return;
     const int body = c.faces.body[i], phase = c.state[body].phase;
     if (phase != SOLVED && phase != LAST_PASSED && phase != ENDED) return;
-    if (phase != SOLVED && c.state[body].rounds >= ROUNDS) return;
+    if (phase != SOLVED && is_held_back(c, c.state[body])) return;
     if (sweep_face(c, body, c.faces.start[0] + i)) c.faces.entered[body] = 1;
 }
 
@@ -172,11 +172,9 @@ __device__ void hold_node(const ContactArguments& c, const SurfaceNode& n) {
     load3(c.x, n.node, from);
     n.displacement(c, y, to);
     for (int k = 0; k < 3; ++k) to[k] += from[k];
-    place_before(c.obstacles, obstacle, way_of(c.obstacles, obstacle, from, to), c.faces.row[last].time, back);
-    double dv[3];
-    for (int k = 0; k < 3; ++k) dv[k] = (back[k] - from[k]) / c.dx_dv - (double)c.predictor[3ll * n.node + k];
-    n.to_material(dv, y);
-    for (int k = 0; k < 3; ++k) c.y[3ll * n.node + k] = (real)y[k];
+    const double time = c.faces.row[last].time;
+    place_before(c.obstacles, c.obstacle_count, obstacle, way_of(c.obstacles, obstacle, from, to), time, from, back, entry_of(c));
+    put_at(c, n, from, back);
 }
 
 // Sets what y still takes into obstacles back; returns the number of nodes. Done by a whole thread block.
@@ -210,7 +208,7 @@ __device__ int hold_body(const ContactArguments& c, int body) {
 extern "C" __global__ void __launch_bounds__(CONTACT_THREADS) finish_faces(const ContactArguments c) {
     const int body = blockIdx.x;
     const bool well = c.results[(c.step[0] % c.capacity) * c.count + body].status != NOT_FINITE;
-    const int held = well && c.state[body].rounds >= ROUNDS ? hold_body(c, body) : 0;
+    const int held = well && is_held_back(c, c.state[body]) ? hold_body(c, body) : 0;
     double sum[2] = {0, 0};
     for (int r = c.faces.start[body] + threadIdx.x; r < c.faces.start[body + 1]; r += CONTACT_THREADS) {
         if (!used(c, r)) continue;

@@ -898,7 +898,7 @@ extern "C" __global__ void __launch_bounds__(CONTACT_THREADS) island_advance(con
         for (long long k = 3ll * i; k < 3ll * i + 3; ++k) a.c.y[k] = (real)__longlong_as_double(0x7ff8000000000000ll);
     if (s.phase != ISLAND_ENDED) return;
     double sum[CG_SUMS] = {};
-    if (i < here.end && s.rounds < ROUNDS) {
+    if (i < here.end && gives_rows(s.rounds, s.passes, a.passes)) {
         const SurfaceNode n = SurfaceNode::at(a.c, i);
         double y[3];
         load3(a.c.y, i, y);
@@ -914,7 +914,8 @@ extern "C" __global__ void __launch_bounds__(CONTACT_THREADS) sweep_island_faces
     const int i = blockIdx.x * CONTACT_THREADS + threadIdx.x;
     if (i >= a.c.faces.start[a.bodies_count] - a.c.faces.start[0]) return;
     const int body = a.c.faces.body[i], island = island_of(a, body);
-    if (island < 0 || a.state[island].phase != ISLAND_ENDED || a.state[island].rounds >= ROUNDS) return;
+    if (island < 0 || a.state[island].phase != ISLAND_ENDED) return;
+    if (!gives_rows(a.state[island].rounds, a.state[island].passes, a.passes)) return;
     if (sweep_face(a.c, body, a.c.faces.start[0] + i)) a.c.faces.entered[body] = 1;
 }
 #endif

@@ -1,11 +1,13 @@
 // SPDX-License-Identifier: MIT
 // The simulation loop on a GPU. It launches the graph of a step repeatedly and reads the results once per batch. The next batch
-// is launched before the results of the last one are read, so that the device never waits for this thread. The rest of the server
-// sends data through mail slots, which are read before each batch. The thread runs without Python's lock. The functions of the
+// is launched before the results of the last one are read, so that the device never waits for this thread. The device writes records
+// into their ring by itself (step_records.cu); this thread adds what only it knows, and what only some scenes have. The rest of the
+// server sends data through mail slots, which are read before each batch. The thread runs without Python's lock. The functions of the
 // driver are a table, so that tests need no GPU.
 #include <sys/prctl.h>
 
 #include <algorithm>
+#include <cstddef>
 #include <vector>
 
 #include "../cpu/native/pair_wrenches.h"
@@ -15,11 +17,17 @@
 
 // Copies new arguments, settings and factors to the device, in the order of the steps, from memory that stays unchanged meanwhile.
 static bool deliver(GpuLoop& l, StepBatch& batch, int slots) {
+    if (!l.posted.exchange(0, std::memory_order_acquire)) return true;
+    bool left = slots < l.mail_slot_count;
     char* next = batch.upload;
     for (int k = 0; k < slots; ++k) {
         MailSlot& slot = l.mail_slots[k];
         if (!slot.pending && slot.posted.load(std::memory_order_relaxed)) slot.pending = slot.posted.exchange(nullptr);
-        if (!slot.pending || (slot.pending->event && !done(l, slot.pending->event))) continue;
+        if (!slot.pending) continue;
+        if (slot.pending->event && !done(l, slot.pending->event)) {
+            left = true;
+            continue;
+        }
         std::memcpy(next, slot.pending->bytes, slot.size);
         CALL(to_device, slot.target, next, (size_t)slot.size, l.stream);
         next += (slot.size + 15) / 16 * 16;
@@ -29,6 +37,7 @@ static bool deliver(GpuLoop& l, StepBatch& batch, int slots) {
         slot.pending = nullptr;
         slot.taken.store(number, std::memory_order_release);
     }
+    if (left) l.posted.store(1, std::memory_order_relaxed);
     return !l.error;
 }
 
@@ -70,9 +79,31 @@ static bool count(GpuLoop& l, int64_t steps) {
     return begin_matrices(l, false) && copy_frame(l);
 }
 
+// Has the device write the records of `steps` steps from `first` on, and notes the end of that in the event of the batch.
+static bool write_records(GpuLoop& l, StepBatch& batch, int64_t first, int64_t steps, int64_t place) {
+    *batch.target = {first, steps, place};
+    CALL(graph_launch, batch.records, l.stream);
+    CALL(event_record, batch.done, l.stream);
+    return true;
+}
+
+// Number of the first record of the batch that ends now; -1 where the ring has no room for all of them, or batches under way have no
+// place yet.
+static int64_t place_of_records(const GpuLoop& l, int64_t steps) {
+    const Rings& rings = l.rings;
+    int64_t place = rings.record_head.load();
+    for (int64_t k = l.finished; k < l.begun; ++k) {
+        const StepBatch& before = l.batches[k % STEP_BATCHES];
+        if (before.place < 0) return -1;
+        place = before.place + before.steps * l.bodies;
+    }
+    return place + steps * l.bodies - rings.record_tail.load(std::memory_order_acquire) <= rings.record_capacity ? place : -1;
+}
+
 static bool close_batch(GpuLoop& l) {
-    CALL(graph_launch, l.energy_balance, l.stream);  // of the last step; the others are part of the next step's first kernel
-    CALL(event_record, l.batches[l.begun % STEP_BATCHES].done, l.stream);
+    StepBatch& batch = l.batches[l.begun % STEP_BATCHES];
+    batch.place = place_of_records(l, batch.steps);
+    if (!write_records(l, batch, batch.first, batch.place < 0 ? 0 : batch.steps, batch.place)) return false;
     ++l.begun;
     return true;
 }
@@ -154,61 +185,74 @@ static void report_pairs(GpuLoop& l, int64_t from, int64_t step) {
     put_reactions(l.rings, found.data(), (int64_t)found.size(), [&] { publish(l); return true; });
 }
 
-static void report(GpuLoop& l, const StepBatch& batch, int64_t k, double end, double cpu) {
+// Adds what only some scenes have to the record of body i. from: of the body in the results. place: of the record.
+static void note_others(GpuLoop& l, int64_t from, int i, int64_t place) {
+    Record& record = l.rings.records[place];
+    if (l.newton_results) {
+        record.nonlinear = l.newton_results[from].nonlinear;
+        record.linearizations = l.newton_results[from].linearizations;
+        if (l.newton_results[from].step_error > 0) record.step_error = l.newton_results[from].step_error;
+    }
+    if (l.stage_results) {
+        record.form = l.stage_results[from].form;
+        record.estimate = l.stage_results[from].estimate;
+        if (record.form == FACTOR) record.residual = l.stage_results[from].inconsistency;
+    }
+    if (l.substep_results) {
+        record.substeps = l.substep_results[from].substeps;
+        record.stable_step = l.substep_results[from].stable_step;
+    }
+    if (l.contact_results) note_contact(l, from, record, place);
+    if (l.held_reactions) note_holders(l, from, place);
+    if (l.measured) note_readings(l, from / l.bodies, i, place);
+}
+
+// Whether the k-th step of the batch has its records in the ring, from record_head on. Where the ring had no room when the batch
+// ended, they are written now, if it has.
+static bool has_records(GpuLoop& l, StepBatch& batch, int64_t k) {
+    if (batch.place >= 0) return true;
+    if (!room_for_records(l.rings, l.bodies, [&] { publish(l); return true; })) return false;
+    return write_records(l, batch, batch.first + k, 1, l.rings.record_head.load()) && await(l, batch.done);
+}
+
+static void report(GpuLoop& l, StepBatch& batch, int64_t k, double end, double cpu) {
     Rings& rings = l.rings;
     const StepTimestamp &stamp = l.timestamps[(batch.first + k) % l.capacity];
     const StepTimestamp &last = l.timestamps[(batch.first + batch.steps - 1) % l.capacity];
-    const int64_t slot = (batch.first + k) % l.capacity * l.bodies;
-    const PcgResult* results = l.results + slot;
-    int64_t step = batch.first + k + 1, head = rings.record_head.load();
-    bool keep = room_for_records(rings, l.bodies, [&] { publish(l); return true; });
+    const int64_t from = (batch.first + k) % l.capacity, step = batch.first + k + 1, head = rings.record_head.load();
+    const bool keep = has_records(l, batch, k);
+    if (l.error) return;
+    Record known;
+    known.step = step;
+    known.time = rings.start_time + step * rings.dt;
+    known.whole = 1e-9 * (stamp.end - stamp.begin);
+    known.late = k ? 0 : batch.late;
+    known.begin = end - 1e-9 * (last.end - stamp.begin);
+    known.cpu = cpu;
+    const bool others = l.newton_results || l.stage_results || l.substep_results || l.contact_results || l.held_reactions || l.measured;
+    int64_t place = head % rings.record_capacity;
     for (int i = 0; keep && i < l.bodies; ++i) {
-        const PcgResult& r = results[i];
-        Record& record = rings.records[(head + i) % rings.record_capacity];
-        record = make_record(rings, step, i, r);
-        record.factor_step = r.factor_step;
-        record.whole = 1e-9 * (stamp.end - stamp.begin);
-        record.late = k ? 0 : batch.late;
-        record.begin = end - 1e-9 * (last.end - stamp.begin);
-        record.cpu = cpu;
-        record.asked = r.asked;
-        record.bad_node = r.bad_node;
-        record.probe = r.probe;
-        if (r.solve_error > 0) record.solve_error = r.solve_error;
-        if (l.newton_results) {
-            record.nonlinear = l.newton_results[slot + i].nonlinear;
-            record.linearizations = l.newton_results[slot + i].linearizations;
-            if (l.newton_results[slot + i].step_error > 0) record.step_error = l.newton_results[slot + i].step_error;
-        }
-        if (l.stage_results) {
-            record.form = l.stage_results[slot + i].form;
-            record.estimate = l.stage_results[slot + i].estimate;
-            if (record.form == FACTOR) record.residual = l.stage_results[slot + i].inconsistency;
-        }
-        if (l.substep_results) {
-            record.substeps = l.substep_results[slot + i].substeps;
-            record.stable_step = l.substep_results[slot + i].stable_step;
-        }
-        if (l.contact_results) note_contact(l, slot + i, record, (head + i) % rings.record_capacity);
-        if (l.held_reactions) note_holders(l, slot + i, (head + i) % rings.record_capacity);
-        if (l.measured) note_readings(l, (batch.first + k) % l.capacity, i, (head + i) % rings.record_capacity);
-        if (l.energy_records) note_energy(record, l.energy_records[slot + i]);
+        known.body = i;
+        std::memcpy(&rings.records[place], &known, offsetof(Record, iterations));
+        if (others) note_others(l, from * l.bodies + i, i, place);
+        if (++place == rings.record_capacity) place = 0;
     }
     rings.step.store(step);
     *l.clock = rings.start_time + step * rings.dt;
-    if (keep && batch.touched) report_grabs(l, (batch.first + k) % l.capacity);
-    if (keep && l.pair_sums) report_pairs(l, (batch.first + k) % l.capacity, step);
+    if (keep && batch.touched) report_grabs(l, from);
+    if (keep && l.pair_sums) report_pairs(l, from, step);
     if (keep) rings.record_head.store(head + l.bodies, std::memory_order_release);
     else rings.records_dropped += l.bodies;
 }
 
 static bool finish_batch(GpuLoop& l) {
     StepBatch& batch = l.batches[l.finished % STEP_BATCHES];
-    if (!await(l, batch.done, l.idle_since + l.step_seconds * batch.steps)) return false;
+    const double lasts = l.step_seconds * batch.steps;
+    if (!await(l, batch.done, l.idle_since + lasts, lasts)) return false;
     double end = l.idle_since = now(), cpu = thread_time();
     const StepTimestamp &first = l.timestamps[batch.first % l.capacity], &last = l.timestamps[(batch.first + batch.steps - 1) % l.capacity];
     l.step_seconds = 1e-9 * (last.end - first.begin) / batch.steps;
-    for (int64_t k = 0; k < batch.steps; ++k) report(l, batch, k, end, (cpu - l.cpu) / batch.steps);
+    for (int64_t k = 0; k < batch.steps && !l.error; ++k) report(l, batch, k, end, (cpu - l.cpu) / batch.steps);
     l.cpu = cpu;
     ++l.finished;
     publish(l);
@@ -267,7 +311,11 @@ int32_t wf_gpu_close(GpuLoop* loop) {
 
 int32_t wf_gpu_take_changes(GpuLoop* loop) { return begin(*loop) && take_changes(*loop); }
 DeviceChanges* wf_gpu_post_changes(GpuLoop* loop, DeviceChanges* changes) { return loop->changes.exchange(changes); }
-Mail* wf_gpu_post(MailSlot* slot, Mail* mail) { return slot->posted.exchange(mail); }
+Mail* wf_gpu_post(GpuLoop* loop, MailSlot* slot, Mail* mail) {
+    Mail* before = slot->posted.exchange(mail);
+    loop->posted.store(1, std::memory_order_release);
+    return before;
+}
 
 // Starts the balance of a body. sums: kinetic and potential energy [J], largest difference of dt v [m], diagonal [m].
 void wf_gpu_start_balance(Balance* balance, const double* sums, double dt, int32_t inertia) {
@@ -280,8 +328,8 @@ void wf_gpu_start_balance(Balance* balance, const double* sums, double dt, int32
 }
 
 const StructSize* wf_sizes() {
-    static const StructSize sizes[] = {SIZE(CudaDriver), SIZE(Mail), SIZE(MailSlot), SIZE(PcgResult), SIZE(StepTimestamp),
-                                       SIZE(NewtonResult), SIZE(StageResult), SIZE(ContactResult), SIZE(SubstepResult), SIZE(BodyReadback), SIZE(GpuLoop), SIZE(Record), SIZE(EnergyRecord),
+    static const StructSize sizes[] = {SIZE(CudaDriver), SIZE(Mail), SIZE(MailSlot), SIZE(RecordTarget), SIZE(StepTimestamp),
+                                       SIZE(NewtonResult), SIZE(StageResult), SIZE(ContactResult), SIZE(SubstepResult), SIZE(BodyReadback), SIZE(GpuLoop), SIZE(Record),
                                        SIZE(Balance), SIZE(Reaction), SIZE(PairSum), SIZE(DeviceCopy), SIZE(DeviceChanges), {}};
     return sizes;
 }

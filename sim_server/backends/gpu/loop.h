@@ -5,7 +5,6 @@
 #include <cstring>
 
 #include "../cpu/native/ring_buffers.h"
-#include "energy_record.cuh"
 #include "step_results.cuh"
 
 typedef uint64_t Address;       // of device memory
@@ -65,7 +64,10 @@ struct BodyReadback {                    // copies of a body's matrix or positio
 struct StepBatch {                     // steps whose results are looked at together
     char* upload;          // pinned; room for one mail of every slot
     void* done;            // event
+    void* records;         // graph that settles the energy balance of the last step and writes the records that `target` says
+    RecordTarget* target;  // pinned
     int64_t first, steps;  // steps completed before the batch; steps in it
+    int64_t place;         // of its first record, which the device writes by itself; -1: the ring had no room for all of them
     double late;
     int32_t touched;       // 1: something is pushed or held in it
 };
@@ -82,10 +84,9 @@ struct GpuLoop {
     MailSlot* mail_slots;
     BodyReadback* readbacks;               // (bodies,)
     int32_t mail_slot_count, bodies;
-    const PcgResult* results;              // (capacity, bodies) pinned, written by the steps
-    const StepTimestamp* timestamps;       // (capacity,) likewise
+    std::atomic<int32_t> posted;           // 1: a slot may have mail
+    const StepTimestamp* timestamps;       // (capacity,) pinned, written by the steps
     const NewtonResult* newton_results;    // (capacity, bodies) likewise; null: one linearization a step
-    const EnergyRecord* energy_records;    // (capacity, bodies) likewise
     const StageResult* stage_results;      // (capacity, bodies) likewise; null: no scheme with stages
     const ContactResult* contact_results;  // (capacity, bodies) likewise; null: no contact
     const SubstepResult* substep_results;  // (capacity, bodies) likewise; null: an implicit scheme
@@ -104,7 +105,7 @@ struct GpuLoop {
     const int64_t* grab_counts;            // (capacity,) likewise
     int64_t most_grabs;
     int32_t touched;                       // 1: the arguments delivered last push or hold something
-    void* energy_balance;                  // graph that writes the energy record of the last step, unless that has been done
+    void* energy_balance;                  // graph that settles the energy balance of the last step, unless that has been done
     void* elastic_energy;                  // graph that adds the elastic energy to it
     void* matrix;                          // graph that makes A of the next step, for a copy; null: each step makes its own
     int64_t capacity, batch;               // batch: most steps in one; divides the capacity
@@ -150,13 +151,14 @@ static bool done(GpuLoop& l, void* event) {
     return !failed(l, answer, "event_query");
 }
 
-// Waits for an event without a busy loop: sleeps until about when it is due, then queries it at intervals.
-static bool await(GpuLoop& l, void* event, double due = 0) {
+// Waits for an event without a busy loop: sleeps until about when it is due, then queries it at intervals, which are longer where the
+// work before it lasts longer. due: steady clock [s]. lasts [s]
+static bool await(GpuLoop& l, void* event, double due = 0, double lasts = 0) {
     for (double begin = now(), t = begin; !done(l, event); t = now()) {
         if (l.error) return false;
         double over = t - (due > begin ? due : begin);
         if (over > 1) { CALL(event_wait, event); return true; }
-        nap(over < 0 ? -over : l.poll + over / 8);
+        nap(over < 0 ? -over : l.poll + lasts / 64 + over / 8);
     }
     return !l.error;
 }

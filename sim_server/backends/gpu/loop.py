@@ -14,7 +14,7 @@ from numpy.typing import DTypeLike, NDArray
 from sim_server.arrays import Float64
 from sim_server.backends.gpu import structs
 from sim_server.backends.gpu.mailbox import DeviceMailbox, library
-from sim_server.backends.gpu.structs import FRAME_COPIES
+from sim_server.backends.gpu.structs import FRAME_COPIES, RECORD_TARGET
 from sim_server.backends.measured import Measured
 from sim_server.backends.ring_buffers import Reports
 from sim_server.errors import DeviceLost
@@ -62,10 +62,8 @@ class DeviceLoop(Reports):
     row_start: of A
     dt: time step [s]
     mailboxes: (device address, bytes) of each
-    results: host memory (CAPACITY, bodies) of PCG_RESULT that the steps write to
-    timestamps: likewise (CAPACITY,) of STEP_TIMESTAMP
+    timestamps: host memory (CAPACITY,) of STEP_TIMESTAMP that the steps write to
     newton_results: likewise (CAPACITY, bodies) of NEWTON_RESULT; None: one linearization a step
-    energy_records: likewise (CAPACITY, bodies) of ENERGY_RECORD
     stage_results: likewise (CAPACITY, bodies) of STAGE_RESULT; None: no scheme with stages
     substep_results: likewise (CAPACITY, bodies) of SUBSTEP_RESULT; None: an implicit scheme
     contact_results: likewise (CAPACITY, bodies) of CONTACT_RESULT; None: no contact
@@ -77,13 +75,15 @@ class DeviceLoop(Reports):
     most_blocks: of A of each body, however it is split (`places` of mailbox.ChangeMailbox.post); none: those of
         row_start, which stay
     addresses: device addresses of values, x and v, and with contact poses (obstacles, 7) of float64
+
+    targets: addresses of the RecordTarget (step_results.cuh) of each batch that may be under way
     """
 
     def __init__(
         self, device: LoopDevice, ranges: Sequence[tuple[int, int]], row_start: NDArray[Any], dt: float,
-        mailboxes: Sequence[tuple[int, int]], results: NDArray[Any], timestamps: NDArray[Any], clock: Float64,
+        mailboxes: Sequence[tuple[int, int]], timestamps: NDArray[Any], clock: Float64,
         records: int | None = None, real: DTypeLike = np.float64, newton_results: NDArray[Any] | None = None,
-        energy_records: NDArray[Any] | None = None, stage_results: NDArray[Any] | None = None,
+        stage_results: NDArray[Any] | None = None,
         contact_results: NDArray[Any] | None = None, contact_reactions: NDArray[Any] | None = None,
         held_reactions: NDArray[Any] | None = None, substep_results: NDArray[Any] | None = None,
         most_blocks: Sequence[int] = (), **addresses: int,
@@ -93,7 +93,7 @@ class DeviceLoop(Reports):
         loop = structs.GpuLoop()
         frame = 3 * nodes * np.dtype(real).itemsize
         frames = device.pinned(FRAMES * 2 * frame).view(real).reshape(FRAMES, 2, nodes, 3)
-        super().__init__(loop, bodies, dt, records, frames)
+        super().__init__(loop, bodies, dt, records, frames, device.pinned)
         self._slots = (structs.MailSlot * max(len(mailboxes), 1))()
         for slot, (target, size) in zip(self._slots, mailboxes, strict=False):
             slot.target, slot.size = target, size
@@ -119,11 +119,10 @@ class DeviceLoop(Reports):
         loop.capacity, loop.batch, loop.many, loop.batch_seconds, loop.poll = CAPACITY, BATCH, MANY, BATCH_SECONDS, POLL
         loop.frame_bytes, loop.clock, loop.matrix_step = frame, clock.ctypes.data, -1
         loop.frame_staging = device.memory(FRAME_COPIES * 2 * frame)
-        loop.results, loop.timestamps = results.ctypes.data, timestamps.ctypes.data
+        loop.timestamps = timestamps.ctypes.data
         loop.newton_results = None if newton_results is None else newton_results.ctypes.data
-        loop.energy_records = None if energy_records is None else energy_records.ctypes.data
         loop.stage_results = None if stage_results is None else stage_results.ctypes.data
-        self._written = (results, timestamps, clock, newton_results, energy_records, stage_results)
+        self._written = (timestamps, clock, newton_results, stage_results)
         loop.substep_results = None if substep_results is None else substep_results.ctypes.data
         self._substeps_written = substep_results
         self._contact_written = (contact_results, contact_reactions, held_reactions)
@@ -141,12 +140,14 @@ class DeviceLoop(Reports):
 
     def _events_and_memory(self, loop: structs.GpuLoop, upload: int) -> list[NDArray[np.uint8]]:
         memory = [self._device.pinned(max(upload, 16)) for _ in loop.batches]
-        for batch, upload_memory in zip(loop.batches, memory, strict=True):
-            batch.upload, batch.done = upload_memory.ctypes.data, self._device.event()
+        targets = [self._device.pinned(RECORD_TARGET.itemsize) for _ in loop.batches]
+        self.targets = [target.ctypes.data for target in targets]
+        for batch, upload_memory, target in zip(loop.batches, memory, self.targets, strict=True):
+            batch.upload, batch.target, batch.done = upload_memory.ctypes.data, target, self._device.event()
         for copy in loop.frame_copies:
             copy.taken, copy.arrived = self._device.event(), self._device.event()
         loop.staged_event, loop.copied_event = self._device.event(), self._device.event()
-        return memory
+        return memory + targets
 
     def report_grabs(self, graph: int, mailbox: int, reactions: NDArray[Any], counts: NDArray[Any]) -> None:
         """Has records come with what bodies exert on grabs.
@@ -177,15 +178,20 @@ class DeviceLoop(Reports):
 
     # --- running ------------------------------------------------------------------------------------------------
 
-    def use_graphs(self, graphs: Sequence[int], energy_balance: int, elastic_energy: int, matrix: int = 0) -> None:
+    def use_graphs(
+        self, graphs: Sequence[int], records: Sequence[int], energy_balance: int, elastic_energy: int, matrix: int = 0
+    ) -> None:  # fmt: skip
         """Sets the handles of the CUDA graphs.
 
         graphs: one step, MANY steps (0: none), then the same two beginning with the kernel that writes the time
-        energy_balance: writes the energy record of the last step
+        records: for each of `targets`, settles the energy balance of the last step and writes the records asked for
+        energy_balance: settles the energy balance of the last step
         elastic_energy: adds the elastic energy to it
         matrix: makes A of the next step, for a copy; 0: each step makes its own
         """
         self.loop.graphs[0][:], self.loop.graphs[1][:] = graphs[:2], graphs[2:]
+        for batch, graph in zip(self.loop.batches, records, strict=True):
+            batch.records = graph
         self.loop.energy_balance, self.loop.elastic_energy = energy_balance, elastic_energy
         self.loop.matrix = matrix
 

@@ -22,7 +22,7 @@ def library() -> c.CDLL:
         {
             "wf_gpu_run": (c.c_int64, [loop, c.c_int64]), "wf_gpu_wait": (c.c_int32, [loop]),
             "wf_gpu_open": (c.c_int32, [loop]), "wf_gpu_renew": (c.c_int32, [loop]),
-            "wf_gpu_close": (c.c_int32, [loop]), "wf_gpu_post": (p, [c.POINTER(structs.MailSlot), p]),
+            "wf_gpu_close": (c.c_int32, [loop]), "wf_gpu_post": (p, [loop, c.POINTER(structs.MailSlot), p]),
             "wf_gpu_post_changes": (p, [loop, p]), "wf_gpu_take_changes": (c.c_int32, [loop]),
             "wf_gpu_start_balance": (None, [p, p, c.c_double, c.c_int32]),
         },
@@ -91,7 +91,7 @@ class DeviceMailbox:
         self.number += 1
         memory = c.create_string_buffer(data, len(data))
         mail = structs.Mail(c.addressof(memory), event, self.number, -1)
-        displaced = library().wf_gpu_post(c.byref(self._slot), c.addressof(mail))
+        displaced = library().wf_gpu_post(c.byref(self._loop), c.byref(self._slot), c.addressof(mail))
         self._leaving = [(step, what) for step, what in self._leaving if step > self._loop.step]
         if displaced:
             self._kept.pop()  # never taken; the mail in use stays
@@ -103,7 +103,8 @@ class DeviceMailbox:
 
     def withdraw(self) -> bool:
         """Takes back mail that was not copied to the device, while the loop stands still; True if there was any."""
-        back = bool(library().wf_gpu_post(c.byref(self._slot), None)) or bool(self._slot.pending)
+        back = bool(library().wf_gpu_post(c.byref(self._loop), c.byref(self._slot), None))
+        back = back or bool(self._slot.pending)
         self._slot.pending = None
         if back:
             self._kept.pop()

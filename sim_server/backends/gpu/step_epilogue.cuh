@@ -1,6 +1,5 @@
 // SPDX-License-Identifier: MIT
-// The end of a step: counts it, resets the counters of the next solve and the flags `moving`, and writes results and time stamps to
-// the host.
+// The end of a step: counts it, resets the counters of the next solve and the flags `moving`, and writes time stamps to the host.
 #pragma once
 #include "clock.cuh"
 
@@ -13,10 +12,8 @@ struct StepEpilogue {
     long long* timestamps;      // (capacity, 2) on the host: begin and end of each step [ns]; a step begins at the end of the one before,
                                 // or at the time of `stamp_begin`
     long long* begun;           // (1,) as the timestamps: of the step under way
-    const long long* results;   // (capacity, result_words)
-    long long* host_results;    // the same on the host
     int* moving;                // (bodies,)
-    int counters, capacity, result_words, bodies;
+    int counters, capacity, bodies;
 };
 
 // True in the thread block of a launch that finishes last.
@@ -34,7 +31,6 @@ __device__ __forceinline__ bool finishes_last(const StepEpilogue& t) {
 // To be called by all threads of the thread block that finishes last.
 __device__ __forceinline__ void end_step(const StepEpilogue& t) {
     const long long done = t.step[0], slot = done % t.capacity;
-    for (int k = threadIdx.x; k < t.result_words; k += blockDim.x) t.host_results[slot * t.result_words + k] = t.results[slot * t.result_words + k];
     for (int k = threadIdx.x; k < t.counters; k += blockDim.x) t.pool_counters[k] = 0;
     for (int k = threadIdx.x; k < t.bodies; k += blockDim.x) t.moving[k] = 0;
     __syncthreads();

@@ -1,5 +1,6 @@
 // SPDX-License-Identifier: MIT
-// What a step leaves for the host, one of each body but the timestamp. Written by the device into memory of the host, read by loop.cpp.
+// What a step leaves, one of each body but the timestamp. PcgResult stays on the device, which makes records of it (step_records.cu);
+// the others are written into memory of the host and read by loop.cpp.
 #pragma once
 
 struct PcgResult {
@@ -33,6 +34,11 @@ struct ContactResult {     // of a step with contact
 struct SubstepResult {    // of a step by explicit substeps
     double stable_step;   // of the body, as estimated last [s]
     int substeps;
+};
+
+struct RecordTarget {      // which steps the device is to write the records of, and where to; the host says it
+    long long first, steps;  // steps completed before the first one; how many
+    long long place;         // number of the first record in the ring
 };
 
 struct StepTimestamp { long long begin, end; };  // ns of the device's clock

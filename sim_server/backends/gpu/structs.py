@@ -6,11 +6,12 @@ import ctypes as c
 from sim_server.backends.declarations import Declarations
 
 LOOP = Declarations("backends/gpu/loop.h")
+RECORDS = Declarations("backends/gpu/step_records.cu")
 PCG = Declarations("backends/gpu/pcg_structs.cuh")
 STAGES = Declarations("backends/gpu/stages.cuh")
 CONTACT = Declarations("backends/gpu/contact_state.cuh")
 CORRECTION = Declarations("backends/gpu/correction_state.cuh")
-ENERGY_RECORD = LOOP.dtype("EnergyRecord")
+ENERGY_RECORD, STEP_RECORDS = RECORDS.dtype("EnergyRecord"), RECORDS.dtype("StepRecords")
 PCG_RESULT = PCG.dtype("PcgResult")
 PAIR_SUM = LOOP.dtype("PairSum")
 NEWTON_RESULT = PCG.dtype("NewtonResult")
@@ -20,6 +21,7 @@ STAGE_STATE, STAGE_SOLVE = STAGES.dtype("StageState"), STAGES.dtype("StageSolve"
 SUBSTEP_RESULT = PCG.dtype("SubstepResult")
 CONTACT_STATE, CONTACT_SOLVE = CONTACT.dtype("ContactState"), CONTACT.dtype("ContactSolve")
 STEP_TIMESTAMP = PCG.dtype("StepTimestamp")
+RECORD_TARGET = PCG.dtype("RecordTarget")
 _requests = LOOP.enumeration("Request")
 REQUEST_VALUES, REQUEST_POSITIONS = _requests["REQUEST_VALUES"], _requests["REQUEST_POSITIONS"]  # of a BodyReadback
 FRAME_COPIES: int = LOOP.constant("FRAME_COPIES")  # frames under way at most

@@ -86,7 +86,7 @@ class Async(UpdatePolicy):
         requests = self._requests()
         requests = requests.of(self.wants(requests, step))
         left, interval = source.faster_busy_workers(), solver.update_floor_steps
-        chosen = pick(requests, left + places, interval, solver.schedule, self._overdue())[left:]
+        chosen = pick(requests, left + places, interval, solver.schedule, self._overdue(source.worker_count()))[left:]
         # Request their matrices; in advance only those of bodies that need a factor
         states = [driver.bodies[body] for body in chosen]
         wanted = states[:idle] + [s for s in states[idle:] if s.job.sent is None or s.solves.excess > 0]
@@ -103,7 +103,8 @@ class Async(UpdatePolicy):
         """Returns a bound by the latencies measured so far."""
         if np.isnan(self.driver.table.latency).all():
             return -1
-        return max_factor_age(self._overdue(), self._latencies(), self.driver.source.worker_count())
+        workers = self.driver.source.worker_count()  # asked once: one may join or leave at any time
+        return max_factor_age(self._overdue(workers), self._latencies(), workers)
 
     def on_job_end(self) -> None:
         """Takes note that there is a body again whose matrix may be requested."""
@@ -148,9 +149,9 @@ class Async(UpdatePolicy):
             else:
                 driver.snapshots.discard(state)
 
-    def _overdue(self) -> float:
-        """Returns the steps after which a body goes next whatever the rule."""
-        solver, workers = self.driver.solver, self.driver.source.worker_count()
+    def _overdue(self, workers: int) -> float:
+        """Returns the steps after which a body goes next whatever the rule; inf without workers."""
+        solver = self.driver.solver
         return max(overdue_after(solver.schedule_rounds, self._latencies(), workers), solver.update_floor_steps)
 
     def _latencies(self) -> Float64:

@@ -8,7 +8,6 @@ earlier run has put them there.
 
 import argparse
 import json
-import socket
 import subprocess
 import sys
 import tempfile
@@ -21,6 +20,7 @@ import numpy as np
 from clients.client import Client
 from clients.errors import ClientError
 from tests.bench.gpu.problem import Problem
+from tests.ports import free_endpoint
 
 PATIENCE = 90.0  # s
 
@@ -33,11 +33,8 @@ def measure(tets: int, first: str = "go", device: str = "gpu", worker: str = "gp
     first: solver.first_factor. Returns: steps and seconds until a step used a factor; of the status queries the number,
     how many failed, and the longest [ms]; of the factors in the last half their number a second and mean age [steps]
     """
-    with tempfile.TemporaryDirectory() as folder, socket.socket() as probe:
-        scene = Problem(tets).write(Path(folder))
-        probe.bind(("127.0.0.1", 0))
-        endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
-        probe.close()
+    with tempfile.TemporaryDirectory() as folder:
+        scene, endpoint = Problem(tets).write(Path(folder)), free_endpoint()
         server = subprocess.Popen(
             [sys.executable, "-m", "sim_server", str(scene), "--device", device, "--realtime", "--workers", "1",
              "--worker-device", worker, "--listen", endpoint, "--set", f"solver.first_factor={first}"],

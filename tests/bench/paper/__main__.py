@@ -28,9 +28,9 @@ def devices(wanted: str) -> list[str]:
     """auto: the CPU and, where there is one, the GPU."""
     if wanted in ("cpu", "gpu"):
         return [wanted]
-    from sim_server.cli import chosen
+    from sim_server.startup.device import choose_device
 
-    return ["cpu"] if chosen("auto", print) == "cpu" else ["cpu", "gpu"]
+    return ["cpu"] if choose_device("auto", print) == "cpu" else ["cpu", "gpu"]
 
 
 def options() -> argparse.Namespace:

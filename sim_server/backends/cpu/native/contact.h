@@ -14,8 +14,8 @@
 // It ends when |r| <= Contact::tolerance max(|b|, |b + i H^T f|) with the law as it is then; a last solve to the tolerance of the step follows.
 //
 // The path of each point of the surface is then swept against all obstacles. Those that pass into one get a row where they enter, or a
-// stiffer one where they have it, and the passes go on, at most ROUNDS times; what is still left is set to SHORT_OF of the way and counted
-// as clipped. A row stays stiffer as long as its force would press it through half of its thickness without that, so that a lasting load
+// stiffer one where they have it, and the passes go on, at most ROUNDS times, while there are any; what is still left is set to SHORT_OF of
+// the way and counted as clipped. A row stays stiffer as long as its force would press it through half of its thickness without that, so that a lasting load
 // that the given stiffness does not bear comes to rest.
 #pragma once
 #include "contact_copies.h"
@@ -88,7 +88,7 @@ static void solve_island(Loop& loop, int island, bool resumes) {
             }
         }
     }
-    for (int k = 0; k < ROUNDS && !outside && p.result.status != NOT_FINITE; ++k) {
+    for (int k = 0; !outside && gives_rows(k, p.report.passes, p.c.passes) && p.result.status != NOT_FINITE; ++k) {
         outside = !sweep_obstacles(p);
         if (!outside) p.solve(false);
     }

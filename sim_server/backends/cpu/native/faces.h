@@ -163,9 +163,10 @@ struct FaceSweep : IslandRows {
                 for (int a = 0; a < 3; ++a) {
                     const int node = faces.nodes_of(k)[a];
                     if (c.free[node] == 0) continue;
+                    const double* from = loop.x + 3 * (int64_t)node;
                     double back[3], dv[3];
-                    place_before(c.obstacles, t.obstacle, *ways[a], time, back);
-                    for (int l = 0; l < 3; ++l) dv[l] = (back[l] - loop.x[3 * (int64_t)node + l]) / c.dx_dv - c.predictor[3 * (int64_t)node + l];
+                    place_before(c.obstacles, c.obstacle_count, t.obstacle, *ways[a], time, from, back, entry());
+                    for (int l = 0; l < 3; ++l) dv[l] = (back[l] - from[l]) / c.dx_dv - c.predictor[3 * (int64_t)node + l];
                     rotated_back(c.rotation + 9 * (int64_t)node, dv, y + 3 * (int64_t)node);
                     ++clipped;
                 }

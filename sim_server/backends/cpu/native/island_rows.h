@@ -53,4 +53,11 @@ struct IslandRows {
             for (int m = 0; m < 3; ++m) s.s[m] = c.dx_dv * (p[m] + u[m]);
         });
     }
+
+    // Of first_entered.
+    auto entry() const {
+        return [&t = c.obstacles](int obstacle, const double* from, const double* to, double* begin, double* end) {
+            return entry_of_way(t, obstacle, 0, from, to, begin, end);
+        };
+    }
 };

@@ -108,19 +108,11 @@ struct ObstacleSweep : IslandRows {
         int clipped = 0;
         each_site([&](int k) {
             const int node = c.corner[CORNERS * k];
-            double from[3], to[3], begin[3], end[3], back[3], earliest = 2;
+            double from[3], to[3], back[3], dv[3];
             if (c.free[node] == 0) return;
             path(k, from, to);
-            for (int o = 0; o < c.obstacle_count; ++o) {
-                const double t = entry_of_way(c.obstacles, o, 0, from, to, begin, end);
-                if (t > 1 || t >= earliest) continue;
-                earliest = t;
-                for (int m = 0; m < 3; ++m) back[m] = begin[m] + SHORT_OF * t * (end[m] - begin[m]);
-                world_point(c.obstacles.end + 7 * o, back, back);
-            }
-            if (earliest > 1) return;
+            if (!place_in_front(c.obstacles, c.obstacle_count, from, to, back, entry())) return;
             ++clipped;
-            double dv[3];
             for (int m = 0; m < 3; ++m) dv[m] = (back[m] - from[m]) / c.dx_dv - c.predictor[3 * (int64_t)node + m];
             rotated_back(c.rotation + 9 * (int64_t)node, dv, y + 3 * (int64_t)node);
         });

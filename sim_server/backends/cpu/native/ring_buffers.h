@@ -7,69 +7,8 @@
 #include <cstdint>
 #include <ctime>
 
-#include "energy_balance.cuh"
-#include "kinds.h"
 #include "reaction.h"
-
-// The step record: one body, one step. Python reads its columns from here; ObjectStep of protocol/messages.proto has those of the
-// same name. On a GPU only the solve is timed apart: assemble and integrate are 0 there, whole is the step's time on the device.
-struct Record {
-    int64_t step = 0;           // steps completed
-    int64_t factor_step = -1;   // of the matrix that the factor was made from; -1: no factor used
-    double time = 0;            // of the simulation at the end of the step [s]
-    double residual = 0;        // true, |b - A y| / |b|; form FACTOR: |y.(b - A y)| / |y.b| of the first stage (step_form.h)
-    double assemble = 0;        // [s], as the next three
-    double solve = 0;
-    double integrate = 0;
-    double whole = 0;
-    double late = 0;            // start of the step after its deadline [s]
-    double begin = 0;           // steady clock [s]
-    double cpu = 0;             // processor time of the loop's thread in the whole step [s]
-    double nonlinear = -1;      // |b| at the end of the step over the first |b|; -1: not evaluated
-    double kinetic = NAN;       // energies (kernels/energy_balance.cuh) [J]; NaN: not evaluated
-    double elastic = NAN;
-    double gravity = NAN;
-    double work = NAN;
-    double budget = NAN;
-    double stride = NAN;        // [m]
-    int32_t body = 0;
-    int32_t iterations = 0;
-    int32_t status = 0;         // Status
-    int32_t kind = 0;           // Kind used at the end of the solve
-    int32_t asked = 0;          // Kind that it began with
-    int32_t fallbacks = 0;      // solves that left their factor
-    int32_t bad_node = -1;      // first node of the body whose b is not finite
-    int32_t probe = 0;          // iterations after which the solve was to go over to the other Kind; 0: never
-    int32_t linearizations = 1;
-    int32_t form = 0;           // StepForm
-    double estimate = NAN;      // of the error of the step, the largest of a node [m]; NaN: the scheme gives none
-    double contact_residual = NAN;  // relative, with the law of contact at the end of the step; NaN: nothing was touched
-    int32_t contacts = 0;       // that carry force
-    int32_t passes = 0;         // solves for them
-    int32_t clipped = 0;        // nodes held back at an obstacle beside the law
-    int32_t halvings = 0;       // the step was made again by 2^halvings short ones; 0: it was not
-    int32_t at_rest = 0;        // 1: nothing was solved, since b of a body at rest is rounding, as the residual is; it says converged
-    int32_t substeps = 0;       // explicit ones of the step; 0: an implicit scheme
-    double stable_step = NAN;   // largest stable substep as estimated last [s]; NaN: an implicit scheme
-    double solve_error = NAN;   // estimated, of the positions, by the last linear solve, largest of a node [m]; NaN: not known
-    double step_error = NAN;    // likewise of the step's equation, the former included; NaN: not evaluated
-};
-
-// b: Balance or EnergyRecord of the body (kernels/energy_balance.cuh).
-template <class B> static inline void note_energy(Record& record, const B& b) {
-    record.kinetic = b.kinetic;
-    record.elastic = b.elastic;
-    record.gravity = b.gravity;
-    record.work = b.work;
-    record.budget = b.budget;
-    record.stride = b.stride;
-    const bool rests = b.phase == FROZEN && !b.found;
-    if (b.phase != WELL && (rests || record.status != NOT_FINITE)) record.status = RUNAWAY;
-    if (!rests) return;
-    record.factor_step = -1;  // there was nothing to solve
-    record.at_rest = 0;
-    record.kind = record.asked;
-}
+#include "step_record.cuh"
 
 struct Rings {
     double dt;
@@ -137,13 +76,7 @@ static inline Record make_record(const Rings& rings, int64_t step, int32_t body,
     record.step = step;
     record.time = rings.start_time + step * rings.dt;
     record.body = body;
-    record.residual = solve.residual;
-    record.solve = solve.seconds;
-    record.iterations = solve.iterations;
-    record.status = solve.status;
-    record.kind = solve.kind;
-    record.fallbacks = solve.fallbacks;
-    record.at_rest = solve.at_rest;
+    note_solve(record, solve);
     return record;
 }
 

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from sim_server.backends.declarations import Declarations
 from sim_server.backends.gpu.cupy_types import DeviceArray
 from sim_server.backends.gpu.device import Gpu
-from sim_server.backends.gpu.inverse.plan import Plan
+from sim_server.backends.gpu.inverse.plan import FORM, GATHER, Plan
 from sim_server.backends.gpu.structs import PCG
 
 PADDING = 32  # entries behind the packed vectors, to which padding refers
@@ -49,26 +49,24 @@ def warp_segments(plan: Plan) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
     return ends[plan.segment_start], np.stack([kind & 3, begin, to, 2 * valid + (kind >> 2 & 1)], 1).astype(np.int32)
 
 
-def entry_index(plan: Plan, cut: NDArray[np.int32]) -> NDArray[np.int64]:
-    """Returns the position of each entry, or its range of contributions, (segments, 32).
+def entry_index(plan: Plan, cut: NDArray[np.int32]) -> NDArray[np.int32]:
+    """Returns the position of each entry, or its range of contributions (first | number << 24), (segments, 32).
 
     Raises ValueError if there are too many contributions.
     """
-    entry = cut[:, 1, None].astype(np.int64) + np.arange(32)
-    formed = (cut[:, 0] == 0)[:, None]
-    start = plan.slot_start.astype(np.int64)
+    start = plan.slot_start
     many = np.diff(start)
     if len(many) and (many.max() > 255 or start[-1] >= 1 << 24):
         raise ValueError(
             f"FactorPattern: {start[-1]} couplings of parts, {many.max()} to a row; "
             f"allowed on a GPU: {(1 << 24) - 1}, 255"
         )
-    position = np.where(formed, entry, 0)
-    slots = start[position] | many[position] << 24
-    boundary = np.append(plan.boundary, 0)
-    return np.where(
-        formed, slots, np.where((cut[:, 0] == 2)[:, None], boundary[np.where(formed, 0, entry) % len(boundary)], entry)
-    )
+    entry = np.add.outer(cut[:, 1], np.arange(32, dtype=np.int32)).astype(np.int32, copy=False)
+    for kind, table in ((FORM, start[:-1] | many << 24), (GATHER, plan.boundary)):
+        chosen = np.flatnonzero(cut[:, 0] == kind)
+        if len(chosen):
+            entry[chosen] = table[entry[chosen]]
+    return entry
 
 
 def paired_tiles(tiles: NDArray[Any], start: NDArray[Any], planes: int) -> tuple[NDArray[np.int32], NDArray[np.int64]]:
@@ -149,10 +147,7 @@ class DevicePlan:
             "segments": cut[segment_order], "index": entry_index(plan, cut[segment_order]), "tiles": tiles,
             "target": target, "place": plan.place,
         }  # fmt: skip
-        self._arrays = {
-            name: gpu.cp.asarray(array.astype(np.int64).astype(np.uint32).view(np.int32))
-            for name, array in arrays.items()
-        }
+        self._arrays = {name: gpu.cp.asarray(array.astype(np.int32, copy=False)) for name, array in arrays.items()}
         params = np.zeros((), DEVICE_PLAN)
         params["phases"], params["blocks"], params["groups"] = plan.phases, plan.blocks, plan.groups
         params["size"], params["entries"] = plan.size, plan.x_area

@@ -1,0 +1,278 @@
+# SPDX-License-Identifier: MIT
+"""Takes in what workers answer: factors alone, in batches and in parts, large ones beside the caller."""
+
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from functools import partial
+from typing import Any, NamedTuple
+
+import zenoh
+
+from protocol.counters import Counters
+from protocol.factor import Factor
+from protocol.messages_pb2 import Factor as FactorMessage
+from protocol.messages_pb2 import FactorBatch
+from protocol.refused import Refused
+from protocol.shared_memory.pool import Slot, SlotPool
+from sim_server.network.bookkeeping import Bookkeeping
+from sim_server.network.factor_fetch import AHEAD, FactorFetch
+from sim_server.network.leases import InFlightJob
+
+LARGE = 4 << 20  # bytes of a factor whose copy and checks take more than a few milliseconds
+FETCHES = 2  # factors that arrive in parts at a time, each in memory of its own
+
+
+class Decoding(NamedTuple):
+    """A factor that is taken in beside the caller.
+
+    future: that is over once it is done, and `take` returns the factor, or raises Refused
+    seconds, by_slot, duration: as of FactorIntake._take_factor
+    fetch: of its parts, if it comes in parts
+    """
+
+    job: InFlightJob
+    future: Future[Any]
+    take: Callable[[], Factor]
+    seconds: float
+    by_slot: tuple[bool, bool]
+    duration: float | None = None
+    fetch: FactorFetch | None = None
+
+
+class FactorIntake:
+    """Checks answers against the jobs in flight, and collects their factors. Methods raise Refused.
+
+    pool: shared memory for parts; None: they travel as bytes
+    factors: that passed all checks, until they are told
+    decoding: what is taken in beside the caller, by number of the job
+    """
+
+    def __init__(
+        self, session: zenoh.Session, server: str, incarnation: int, pool: SlotPool | None, counters: Counters,
+        book: Bookkeeping,
+    ):  # fmt: skip
+        self._session, self._server, self._incarnation = session, server, incarnation
+        self._pool, self._counters, self._book = pool, counters, book
+        self._thread = ThreadPoolExecutor(1, "large factors")
+        self._fetching = ThreadPoolExecutor(FETCHES, "parts of factors")
+        self.factors: list[Factor] = []
+        self.decoding: dict[int, Decoding] = {}
+        self._fetches: set[int] = set()  # of these, the jobs whose factors come in parts
+
+    def fetched_from(self, worker: str) -> int:
+        """Number of factors that are fetched from a worker part by part."""
+        return sum(self.decoding[number].job.worker == worker for number in self._fetches)
+
+    def is_decoded(self, job: InFlightJob) -> bool:
+        """True while the answer to a job is taken in beside the caller."""
+        return job.number in self.decoding
+
+    def is_arriving(self, job: InFlightJob) -> bool:
+        """True while the answer to a job is taken in, unless it comes in parts and none comes any more."""
+        each = self.decoding.get(job.number)
+        return each is not None and not (each.fetch is not None and each.fetch.stalls)
+
+    # ---- messages --------------------------------------------------------------------------------------------
+
+    def on_factor(self, sample: zenoh.Sample) -> None:
+        """Takes the answer to a job that went alone."""
+        message = self._book.decoder.parse_factor(sample.key_expr, sample.attachment)
+        job = self._book.leases.match_answer(message.job, message.worker, message.header.epoch)
+        self._book.registry.mark_seen(job.worker, self._book.clock())
+        self._note_answer(job.worker)
+        if self._book.leases.is_reassigned(job):
+            return self._book.leases.finish(job, None if message.failure else message.seconds)
+        if message.parts and not message.failure:
+            return self._fetch(message, job)
+        decode = partial(self._book.decoder.decode, message, sample.payload, job)
+        if not message.failure and 4 * message.nonzeros > LARGE:  # its bytes are copied and checked beside the caller
+            self._refuse_second(job)
+            future = self._thread.submit(decode)
+            self.decoding[job.number] = Decoding(job, future, future.result, message.seconds, _slots_used(message))
+            return
+        self._take_factor(job, decode, message.failure, message.seconds, _slots_used(message))
+
+    def on_factors(self, sample: zenoh.Sample) -> None:
+        """Takes answers to jobs of a batch, each by itself: what is wrong with one costs the others nothing."""
+        message = self._book.decoder.parse_batch(sample.key_expr, sample.attachment)
+        self._book.registry.mark_seen(message.worker, self._book.clock())
+        duration, large = 0.0, 4 * sum(message.nonzeros) > LARGE
+        beside: dict[int, tuple[int, InFlightJob]] = {}  # by number; large all together: decoded beside the caller
+        for place, number in enumerate(message.jobs):
+            try:
+                job = self._book.leases.match_answer(number, message.worker, None)
+                if not duration:
+                    duration = self._duration(job) / len(message.jobs)
+                    self._note_answer(message.worker)
+                if self._takes_beside(message, place, job, large):
+                    if number in self.decoding or number in beside:
+                        raise Refused(f"FactorBatch.jobs has {number}, already answered", "duplicate")
+                    beside[number] = place, job
+                else:
+                    self._take_one(message, place, job, duration)
+            except Refused as refusal:
+                self._counters.refuse(refusal)
+        if beside:
+            future = self._thread.submit(self._book.decoder.decode_several, message, list(beside.values()))
+            for k, (place, job) in enumerate(beside.values()):
+                take, by_slot = partial(_result, future, k), (message.matrix_shared, True)
+                self.decoding[job.number] = Decoding(job, future, take, message.seconds[place], by_slot, duration)
+
+    def _takes_beside(self, message: FactorBatch, place: int, job: InFlightJob, large: bool) -> bool:
+        return large and not _failure(message, place) and not self._book.leases.is_reassigned(job)
+
+    def _take_one(self, message: FactorBatch, place: int, job: InFlightJob, duration: float) -> None:
+        """Takes an answer of a batch at once."""
+        if self._book.leases.is_reassigned(job):
+            self._book.leases.finish(job)
+        elif failure := _failure(message, place):
+            self._take_factor(job, _no_factor, failure, 0.0, (True, True))
+        else:
+            decode, by_slot = partial(self._book.decoder.decode_one, message, place, job), (message.matrix_shared, True)
+            self._take_factor(job, decode, "", message.seconds[place], by_slot, duration)
+
+    def _note_answer(self, worker: str) -> None:
+        self._book.free_since[worker] = self._book.clock()
+        self._book.reliability.on_answer(worker)
+
+    def _refuse_second(self, job: InFlightJob) -> None:
+        if self.is_decoded(job):
+            raise Refused(f"Factor.job is {job.number}, already answered", "duplicate")
+
+    # ---- factors in parts ------------------------------------------------------------------------------------
+
+    def _fetch(self, message: FactorMessage, job: InFlightJob) -> None:
+        """Begins to fetch a factor in parts, beside the caller. Its worker is free for the jobs of other objects."""
+        self._refuse_second(job)
+        fetch = FactorFetch(
+            self._session, self._server, self._incarnation, self._counters, job, message.nonzeros, message.parts,
+            self._slots_for_parts(job),
+        )  # fmt: skip
+        decode = partial(self._book.decoder.decode, message, b"", job, fetch.run)
+        future, by_slot = self._fetching.submit(decode), _slots_used(message, fetch)
+        self.decoding[job.number] = Decoding(job, future, future.result, message.seconds, by_slot, fetch=fetch)
+        self._fetches.add(job.number)
+
+    def _slots_for_parts(self, job: InFlightJob) -> list[Slot]:
+        """Allocates the slots of a fetch; none if parts must travel as bytes."""
+        info = self._book.registry.info(job.worker)
+        if self._pool is None or info is None or not info.shared_memory:
+            return []
+        slots = [slot for slot in (self._pool.lend(job.part_bytes) for _ in range(AHEAD)) if slot is not None]
+        if len(slots) == AHEAD:
+            return slots
+        self._give_back(slots)
+        return []
+
+    def _give_back(self, slots: Sequence[Slot], clean: bool = True) -> None:
+        """Frees the slots of a fetch. clean: nobody writes to them any more."""
+        if self._pool is not None:
+            for slot in slots:
+                (self._pool.give_back if clean else self._pool.discard)(slot)
+
+    def _end_gone(self, job: InFlightJob) -> None:
+        """Frees the worker of a job that is over, if it is still there."""
+        leases = self._book.leases
+        if leases.by_worker.get(job.worker, {}).get(job.number) is job:
+            if leases.is_reassigned(job):  # its parts did not come
+                self._book.reliability.on_failure(job.worker, job.object, self._book.clock())
+            leases.finish(job)
+
+    # ---- factors that are there ------------------------------------------------------------------------------
+
+    def take_decoded(self) -> None:
+        """Takes the large factors that were decoded beside the caller, unless their jobs are over."""
+        for number in self._fetches:
+            job, fetch = self.decoding[number].job, self.decoding[number].fetch
+            if fetch is not None and self._book.leases.by_object.get(job.object) is not job:
+                fetch.give_up()
+        done = {id(future) for future in {each.future for each in self.decoding.values()} if future.done()}
+        for number in [number for number, each in self.decoding.items() if id(each.future) in done]:
+            each = self.decoding.pop(number)
+            self._fetches.discard(number)
+            try:
+                self._end_decoding(each)
+            except Refused as refusal:
+                self._counters.refuse(refusal)
+
+    def _end_decoding(self, each: Decoding) -> None:
+        job, fetch, by_slot = each.job, each.fetch, each.by_slot
+        if fetch is not None:
+            self._give_back(fetch.slots, fetch.clean)
+            if fetch.gone.is_set():  # why its job is over was told
+                return self._end_gone(job)
+            by_slot = by_slot[0], bool(fetch.slots)
+        current = self._book.leases.match_answer(job.number, job.worker, job.epoch)
+        if self._book.leases.is_reassigned(current):
+            return self._book.leases.finish(current)
+        self._take_factor(current, each.take, "", each.seconds, by_slot, each.duration)
+
+    def _take_factor(
+        self, job: InFlightJob, decode: Callable[[], Factor], failure: str, told: float, by_slot: tuple[bool, bool],
+        duration: float | None = None,
+    ) -> None:  # fmt: skip
+        """Takes the answer to a job: the factor that `decode` returns, or a failure.
+
+        told: time [s] of the factorization, by the worker
+        by_slot: matrix and factor travelled in shared memory
+        duration: from matrix to factor [s]; None: until now
+        """
+        book, seconds = self._book, None
+        try:
+            if failure:
+                self._counters.add("failures")
+                book.reliability.on_failure(job.worker, job.object, book.clock())
+                return book.fail(job, f"failed: {failure[:500]}")
+            self.factors.append(decode())
+            seconds = told
+            lasted = self._duration(job) if duration is None else duration
+            book.timing.record(job.worker, job.object, lasted, seconds)
+        except Refused as refusal:
+            book.reliability.on_failure(job.worker, job.object, book.clock())
+            book.fail(job, f"was refused: {refusal}")
+            raise
+        finally:
+            book.leases.finish(job, seconds)
+        self._count(job, self.factors[-1].values.nbytes, by_slot)
+
+    def _duration(self, job: InFlightJob) -> float:
+        """Time [s] from matrix to factor, without that for which the job waited behind others of its worker."""
+        now = self._book.clock()
+        last, self._book.answered_at[job.worker] = self._book.answered_at.get(job.worker, 0.0), now
+        return now - max(job.sent_at, last)
+
+    def _count(self, job: InFlightJob, size: int, by_slot: tuple[bool, bool]) -> None:
+        """Counts a factor of `size` bytes, and how it and its matrix travelled."""
+        self._counters.add("factors")
+        self._counters.add("bytes_in", size)
+        capacity = job.factor_slot.capacity if job.factor_slot is not None else 0
+        fits = 0 < size <= capacity  # an incomplete factor may be the largest so far
+        for what, shared, allocated in (("matrix", by_slot[0], bool(job.slots)), ("factor", by_slot[1], fits)):
+            self._counters.add("bulk_shared" if shared else "bulk_copied")
+            if allocated and not shared:
+                self._counters.trouble(
+                    "slots_unused", f"a slot was lent to worker {job.worker}, but its {what} travelled as bytes"
+                )
+
+
+def _failure(message: FactorBatch, place: int) -> str:
+    """Why a worker made no factor for a job of a batch; empty if it did."""
+    return message.failures[place] if message.failures else ""
+
+
+def _no_factor() -> Factor:
+    """Raises Refused: the worker has told why there is none."""
+    raise Refused("there is no factor", "malformed")
+
+
+def _result(future: Future[list[Factor | Refused]], place: int) -> Factor:
+    """Returns one of several factors that were decoded together; raises Refused."""
+    found = future.result()[place]
+    if isinstance(found, Refused):
+        raise found
+    return found
+
+
+def _slots_used(message: FactorMessage, fetch: FactorFetch | None = None) -> tuple[bool, bool]:
+    """Whether matrix and factor travelled in shared memory. fetch: of its parts"""
+    return message.matrix_shared, message.HasField("slot") or (fetch is not None and bool(fetch.slots))

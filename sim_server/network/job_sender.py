@@ -1,0 +1,289 @@
+# SPDX-License-Identifier: MIT
+"""Sends jobs to workers: alone or in batches, with slots of shared memory for what fits."""
+
+import time
+from collections import deque
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache, partial
+
+import numpy as np
+import zenoh
+
+from protocol.channels import PART_BYTES, WHOLE_PARTS, key
+from protocol.counters import Counters
+from protocol.messages_pb2 import MatrixBatch
+from protocol.method import Method
+from protocol.shared_memory.pool import Slot, SlotPool
+from sim_server.arrays import Float64
+from sim_server.network.batch_message import MOST_TOGETHER, Entry, batch_message, entries_of, fill, group
+from sim_server.network.bookkeeping import Bookkeeping
+from sim_server.network.job_message import add_values, matrix_message
+from sim_server.network.leases import InFlightJob
+from sim_server.network.send_queue import SendQueue
+from sim_server.network.worker_choice import WorkerChoice
+from sim_server.updates.factor_source import Job
+
+FAST_SEND = 0.05  # s in which a fast link takes a job as bytes; zenoh drops what is not taken within 0.25 s
+BEHIND = 10.0  # s of a lease, at most, for what waits at a worker behind a first job, which has a longer one
+MAX_SENT = 4096  # times of jobs that are remembered
+SLOT_SHARE = 4  # a larger part of all shared memory than a SLOT_SHARE-th is not lent for one factor: it goes in parts
+SLOT_MARGIN = 8  # the slot for an incomplete factor is larger than the largest factor so far by a SLOT_MARGIN-th
+
+
+@dataclass
+class Filling:
+    """Slots of a batch that the thread of the queue fills and sends; `over` once it has."""
+
+    slots: tuple[Slot, Slot]
+    over: bool = False
+
+
+class JobSender:
+    """Sends jobs through a queue, so that nobody waits for the network.
+
+    pool: shared memory for arrays; None: they travel as bytes
+    """
+
+    def __init__(
+        self, session: zenoh.Session, server: str, incarnation: int, pool: SlotPool | None, queue: SendQueue,
+        counters: Counters, book: Bookkeeping, choice: WorkerChoice,
+    ):  # fmt: skip
+        self._session, self._server, self._incarnation = session, server, incarnation
+        self._pool, self._queue, self._counters = pool, queue, counters
+        self._book, self._choice = book, choice
+        self._sent: dict[int, float] = {}  # when the network took a job, by its number
+        self._filling: deque[Filling] = deque()  # oldest first
+        self._fast_links: set[str] = set()  # workers without shared memory whose link takes a job at once
+
+    def sent_at(self, job: InFlightJob) -> float:
+        """Time at which the network took a job [s, monotonic]; inf: it has not yet."""
+        return self._sent.get(job.number, float("inf"))
+
+    def forget_link(self, worker: str) -> None:
+        """Takes the link to a worker for slow until it shows that it is fast."""
+        self._fast_links.discard(worker)
+
+    def forget_sent(self) -> None:
+        """Forgets when jobs were sent that are over, once they are many."""
+        if len(self._sent) > MAX_SENT:
+            flying = {job.number for job in self._book.leases.jobs}
+            self._sent = {number: when for number, when in self._sent.items() if number in flying}
+
+    def give_back_sent(self) -> None:
+        """Gives back slots that the thread of the queue needs no more: they are free once their jobs are over, too."""
+        while self._filling and self._filling[0].over:
+            self._give_back(self._filling.popleft().slots)
+
+    def _give_back(self, slots: Sequence[Slot]) -> None:
+        if self._pool is not None:
+            for slot in slots:
+                self._pool.give_back(slot)
+
+    def submit(self, job: Job) -> bool:
+        """Sends a job alone; False if no worker has room or the object has a job in flight."""
+        self._check(job)
+        idle = [name for name in self._choice.open() if not job.positions or self._choice.assembles(name)]
+        idle = self._choice.candidates(idle, job.object)
+        if job.object in self._book.leases.by_object or not idle:
+            return False
+        return self._send_alone(self._choice.choose(idle, job.object), job)
+
+    def submit_many(self, jobs: Sequence[Job]) -> list[bool]:
+        """Sends jobs of different objects, the most urgent first, those of small objects to one worker in one message.
+
+        False as of `submit`.
+        """
+        taken = [False] * len(jobs)
+        batches: dict[tuple[str, tuple[str, Method]], list[int]] = {}  # places of jobs by worker and what they share
+        rooms = self._choice.rooms() if len(jobs) > 1 else {}
+        able = {name for name in rooms if self._choice.takes_batches(name)}
+        for place, job in enumerate(jobs):
+            idle = [name for name, room in rooms.items() if room > 0]
+            worker = self._worker_for(job, idle, rooms) if idle else None
+            if worker is None or worker not in able or not self._fits_batch(job):
+                taken[place] = self.submit(job)
+                rooms = self._choice.rooms()
+                for (name, _), places in batches.items():
+                    rooms[name] = rooms.get(name, 0) - len(places)
+            else:
+                rooms[worker] -= 1
+                batches.setdefault((worker, group(job)), []).append(place)
+        for (worker, _), places in batches.items():
+            for k in range(0, len(places), MOST_TOGETHER):
+                part = places[k : k + MOST_TOGETHER]
+                for place, sent in zip(part, self._send_batch(worker, [jobs[p] for p in part]), strict=True):
+                    taken[place] = sent
+        return taken
+
+    def _check(self, job: Job) -> None:
+        known = self._book.decoder.objects.get(job.object)
+        if known is None or known.epoch != job.epoch:
+            raise ValueError(f"job for {job.object} epoch {job.epoch}, which was not announced")
+        shape = (known.size // 3, 3) if job.positions else (known.blocks, 3, 3)
+        if job.values.shape != shape or job.values.dtype != np.float64:
+            raise ValueError(f"job for {job.object}: values {job.values.shape}, allowed: float64 {shape}")
+
+    def _worker_for(self, job: Job, idle: list[str], rooms: Mapping[str, int]) -> str | None:
+        """Chooses a worker of those with room; None if there is none or the object has a job in flight."""
+        self._check(job)
+        if job.object in self._book.leases.by_object:
+            return None
+        able = [name for name in idle if not job.positions or self._choice.assembles(name)]
+        if self._book.reliability.failing_objects:
+            able = self._choice.candidates(able, job.object)
+        return self._choice.choose(able, job.object, rooms) if able else None
+
+    def _fits_batch(self, job: Job) -> bool:
+        """True if the size of the factor is known: that of an incomplete one may grow."""
+        sized = self._book.decoder.objects[job.object].most_values(job.method.name) > 0
+        return not job.positions and sized and job.method.name != "incomplete_cholesky"
+
+    # ---- a batch ---------------------------------------------------------------------------------------------
+
+    def _send_batch(self, worker: str, jobs: Sequence[Job]) -> list[bool]:
+        """Sends jobs to a worker in one message, or one by one if there are no slots for them together."""
+        slots, leases = None, self._book.leases
+        if len(jobs) > 1:
+            entries = entries_of([(job, self._book.decoder.objects[job.object]) for job in jobs])
+            slots = self._allocate_batch(entries)
+        if slots is None:
+            return [self._send_alone(worker, job) for job in jobs]
+        seconds = [leases.lease(job.object, worker, job.method.name) for job in jobs]
+        in_flight = [
+            self._begin(job, worker, lease, slots, factor_slot=slots[1], first=entry.first, room=entry.room)
+            for job, lease, entry in zip(jobs, seconds, entries, strict=True)
+        ]
+        message = batch_message(entries, in_flight, seconds, self._incarnation, *slots)
+        filling, matrices = Filling(slots), [job.values for job in jobs]
+        if self._queue.post(partial(self._fill_and_put, message, matrices, in_flight, filling)):
+            self._filling.append(filling)
+            self._on_sent(worker, jobs)
+            return [True] * len(jobs)
+        for job in in_flight:
+            leases.cancel(job)
+        self._give_back(slots)
+        return [False] * len(jobs)
+
+    def _fill_and_put(
+        self, message: MatrixBatch, matrices: Sequence[Float64], jobs: Sequence[InFlightJob], filling: Filling
+    ) -> None:  # fmt: skip
+        """Copies matrices and sends them, in the thread of the queue. The slots are not lent again meanwhile."""
+        slot, name = filling.slots[0], key("matrices", self._server, worker=message.worker)
+        try:
+            fill(message, matrices, slot)
+            self._put(jobs, name, slot.payload, message.SerializeToString(), True)
+        finally:
+            filling.over = True
+
+    def _allocate_batch(self, entries: Sequence[Entry]) -> tuple[Slot, Slot] | None:
+        """Allocates a slot for matrices and one for factors; None if there is not enough shared memory."""
+        assert self._pool is not None
+        users = len(entries) + 1  # and the thread that sends them
+        matrices = self._pool.lend(sum(entry.job.values.nbytes for entry in entries), users)
+        factors = self._pool.lend(entries[-1].first + entries[-1].room, users)
+        if matrices is not None and factors is not None:
+            return matrices, factors
+        for slot in filter(None, (matrices, factors)):
+            for _ in range(users):
+                self._pool.give_back(slot)
+        return None
+
+    # ---- a job alone -----------------------------------------------------------------------------------------
+
+    def _send_alone(self, worker: str, job: Job) -> bool:
+        matrix_slot, factor_slot = self._allocate(worker, job)
+        known = self._book.decoder.objects[job.object]
+        lease = self._book.leases.lease(job.object, worker, job.method.name, job.positions, known.blocks)
+        slots = tuple(slot for slot in (matrix_slot, factor_slot) if slot is not None)
+        payload_bytes = 0 if matrix_slot else job.values.nbytes
+        in_flight = self._begin(job, worker, lease, slots, factor_slot=factor_slot, payload_bytes=payload_bytes)
+        message = matrix_message(in_flight, known, self._incarnation, lease, job.method)
+        payload = add_values(message, job.values, matrix_slot)
+        name, attachment = key("matrix", self._server, worker=worker, object=job.object), message.SerializeToString()
+        if self._queue.post(lambda: self._put([in_flight], name, payload, attachment, matrix_slot is not None)):
+            self._on_sent(worker, [job])
+            return True
+        self._book.leases.cancel(in_flight)
+        return False
+
+    def _allocate(self, worker: str, job: Job) -> tuple[Slot | None, Slot | None]:
+        """Allocates slots for the matrix and its factor; None for an array that must travel as bytes, as the first
+        large one does while its slot is being made: the caller would wait for that as long as many rounds take."""
+        if self._pool is None or not self._choice.has_slots(worker):
+            return None, None
+        nonzeros = self._book.decoder.objects[job.object].most_values(job.method.name)
+        if job.method.name == "incomplete_cholesky":
+            nonzeros += nonzeros // SLOT_MARGIN  # the next factor may keep more blocks
+        size = nonzeros * np.dtype(job.dtype).itemsize
+        if size > max(WHOLE_PARTS * PART_BYTES, self._pool.limit // SLOT_SHARE):
+            size = 0  # it comes in parts
+        pool, sizes = self._pool, [job.values.nbytes, *([size] if size else [])]
+        slots = [pool.lend(each, beside=True) for each in sizes]
+        if any(slot is None and not pool.is_making(each) for slot, each in zip(slots, sizes, strict=True)):
+            self._counters.trouble("slots_exhausted", "no slot of shared memory is left, an array travels as bytes")
+        matrix, factor = [*slots, None][:2]
+        return matrix, factor
+
+    # ---- both ------------------------------------------------------------------------------------------------
+
+    def _begin(
+        self, job: Job, worker: str, lease: float, slots: tuple[Slot, ...], factor_slot: Slot | None, **more: int
+    ) -> InFlightJob:
+        """Begins the lease of a job that is being sent. more: fields of InFlightJob"""
+        now, leases = self._book.clock(), self._book.leases
+        in_flight = InFlightJob(
+            leases.next_number(),
+            job.object,
+            job.epoch,
+            job.step,
+            job.warp,
+            _dtype_name(job.dtype),
+            worker,
+            deadline=now + max(lease, min(leases.deadlines().get(worker, 0.0) - now, BEHIND)),
+            factor_slot=factor_slot,
+            factor_generation=factor_slot.generation if factor_slot else 0,
+            slots=slots,
+            sent_at=now,
+            exclusive_until=now + leases.exclusive_period(job.object, self._book.decoder.objects[job.object].blocks),
+            method=job.method.name,
+            positions=job.positions,
+            part_bytes=PART_BYTES,
+            **more,
+        )
+        leases.start(in_flight)
+        return in_flight
+
+    def _on_sent(self, worker: str, jobs: Sequence[Job]) -> None:
+        for job in jobs:
+            self._book.last_worker[job.object] = worker
+        self._book.reliability.on_sent(worker, self._book.clock())
+        self._counters.add("jobs", len(jobs))
+        self._counters.add("bytes_out", sum(job.values.nbytes for job in jobs))
+
+    def _put(
+        self, jobs: Sequence[InFlightJob], name: str, payload: zenoh.ZBytes, attachment: bytes, shared: bool
+    ) -> None:  # fmt: skip
+        """Sends a job or a batch of them, in the thread of the send queue. If a link is full, zenoh drops it or blocks.
+
+        A dropped job ends its lease. zenoh blocks only for bytes over a link that is not known to be fast, since a
+        slow link takes longer than zenoh would keep them. While it blocks for one receiver all others wait too, even
+        for a receiver that subscribed to everything and stopped reading. The priority is one of its own, since a
+        blocked message locks the queue of its priority.
+        """
+        worker = jobs[0].worker
+        drop = shared or worker in self._fast_links
+        control = zenoh.CongestionControl.DROP if drop else zenoh.CongestionControl.BLOCK
+        begin = time.perf_counter()
+        self._session.put(
+            name, payload, attachment=attachment, congestion_control=control, priority=zenoh.Priority.BACKGROUND
+        )
+        if not drop and time.perf_counter() - begin < FAST_SEND:
+            self._fast_links.add(worker)
+        for job in jobs:
+            self._sent[job.number] = self._book.clock()
+
+
+@cache
+def _dtype_name(dtype: str) -> str:
+    return np.dtype(dtype).name
