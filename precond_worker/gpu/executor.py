@@ -83,7 +83,6 @@ class Executor:
                 "entry_row": cp.asarray(plan.entry_row),
             }
             self._sent = self._pinned(9 * plan.blocks, np.dtype(np.float64))
-            self._outcome = self._pinned(3, np.dtype(np.int32))
         except (cp.cuda.memory.OutOfMemoryError, cp.cuda.runtime.CUDARuntimeError) as error:
             self.__dict__.clear()
             memory.free_all_blocks()
@@ -138,21 +137,22 @@ class Executor:
         sent = self._sent.reshape(self._copies, -1)
         count = len(matrices) if self._full else self._copies
         values = self._pinned(len(matrices) * self.plan.nonzeros // self._copies, self._stored)
+        outcome = self._pinned(3, np.dtype(np.int32))
         with self._usable():
             self.stream.synchronize()
             for k in range(count):  # at first, and after a failure, also what takes the place of those that are missing
                 np.copyto(sent[k], matrices[min(k, len(matrices) - 1)].reshape(-1))
             self._copy(self._blocks.data.ptr, sent.ctypes.data, sent[:count].nbytes)
             self._graph.launch(self.stream)
-            self._copy(self._outcome.ctypes.data, self._status.data.ptr, self._outcome.nbytes)
+            self._copy(outcome.ctypes.data, self._status.data.ptr, outcome.nbytes)
             self._copy(values.ctypes.data, self._values.data.ptr, values.nbytes)
         self._full = self._copies == 1  # until it is known that none failed
-        return partial(self._end, values.reshape(len(matrices), -1))
+        return partial(self._end, values.reshape(len(matrices), -1), outcome)
 
-    def _end(self, values: NDArray[Any]) -> tuple[NDArray[Any], Outcome]:
+    def _end(self, values: NDArray[Any], found: NDArray[np.int32]) -> tuple[NDArray[Any], Outcome]:
         with self._usable():
             self.stream.synchronize()
-        pivot, range_, infinite = (-1 if c == NONE else int(c) for c in self._outcome)
+        pivot, range_, infinite = (-1 if c == NONE else int(c) for c in found)
         outcome = Outcome(pivot, range_, bool(infinite))
         self._full = self._copies == 1 or outcome == Outcome(-1, -1, False)
         return values, outcome

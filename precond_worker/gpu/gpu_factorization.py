@@ -92,7 +92,8 @@ class GpuFactorization:
             precision = "float64" if stored == "float64" else self._precision
             plan = known[0].plan if known else self._plan_of(count)
             known.append(Executor(plan, precision, stored, count))
-        known.append(known.pop(0))
+        else:
+            known.append(known.pop(0))
         return known[-1]
 
     def _plan_of(self, count: int) -> MultifrontalPlan:
