@@ -45,6 +45,7 @@ class Executor:
         self._list, starts = launch_list(plan)
         self._reserve(starts)
         self.stream = self._cp.cuda.Stream(non_blocking=True)
+        self._running: tuple[NDArray[Any], ...] = ()
         with self.stream:
             self.stream.begin_capture()
             try:
@@ -140,6 +141,7 @@ class Executor:
         outcome = self._pinned(3, np.dtype(np.int32))
         with self._usable():
             self.stream.synchronize()
+            self._running = values, outcome  # the device writes to them, whatever becomes of what is returned
             for k in range(count):  # at first, and after a failure, also what takes the place of those that are missing
                 np.copyto(sent[k], matrices[min(k, len(matrices) - 1)].reshape(-1))
             self._copy(self._blocks.data.ptr, sent.ctypes.data, sent[:count].nbytes)
