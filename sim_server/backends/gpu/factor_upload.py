@@ -5,12 +5,16 @@ Each body has two storages per pattern (double buffering). A build begins once t
 step under way reads the other storage. A factor that arrives earlier is queued; a newer one replaces it. Plans, made
 once per pattern, and the copies of large factors, or of many, are left to a thread (PcgSolver.beside), for which the
 thread that serves the loop does not wait. Many small ones of one plan are built together.
+
+A factor may be *prepared* while it is checked: its inverse is built, applied once for the check, and kept out of use
+until the factor is posted, or dropped.
 """
 
 import logging
 import threading
 from collections.abc import Sequence
-from concurrent.futures import Future, wait
+from concurrent.futures import Future, InvalidStateError, wait
+from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any, NamedTuple
@@ -18,8 +22,10 @@ from typing import Any, NamedTuple
 from numpy.typing import NDArray
 
 from protocol.factor import FactorPattern
+from sim_server.arrays import Float64
 from sim_server.backends.compiler import CompileError
 from sim_server.backends.gpu.device import Gpu, no_memory_left
+from sim_server.backends.gpu.inverse.apply_inverse import Applied
 from sim_server.backends.gpu.inverse.build_inverse import InverseStorage, PartitionedInverse
 from sim_server.backends.gpu.loop import DeviceLoop
 from sim_server.backends.gpu.mailbox import DeviceMailbox
@@ -31,6 +37,7 @@ log = logging.getLogger(__name__)
 SMALL = 1 << 20  # bytes of a factor that is copied at once
 MANY = 4  # small factors that come together, from which on none is built at once
 TOGETHER = 64  # factors of one plan that are handed over together
+BUSY = 0.25  # share of dt that steps in real time take, up to which builds may have the whole device
 MAX_PATTERNS = 2  # of a body at a time; workers with different libraries send different patterns
 
 
@@ -43,12 +50,33 @@ class UploadedFactor(NamedTuple):
     pattern: FactorPattern
 
 
-class GivenFactor(NamedTuple):
-    """A factor that came. Its values do not change any more."""
+@dataclass(eq=False)
+class GivenFactor:
+    """A factor that came. Its values do not change any more.
+
+    r: vector that its inverse is to be applied to. None: to none
+    applied: P^-1 r on its way; None: nobody applies it
+    wanted: it is to be used; False: once it is posted
+    dropped: nobody wants it any more
+    """
 
     pattern: FactorPattern
     values: NDArray[Any]
     step: int
+    r: Float64 | None = None
+    applied: "Future[Applied | None]" = field(default_factory=Future)
+    wanted: bool = True
+    dropped: bool = False
+
+    def drop(self) -> None:
+        """Gives it up."""
+        self.dropped = True
+        self.tell(None)
+
+    def tell(self, applied: Applied | None) -> None:
+        """Tells who waits for P^-1 r, if it is not told yet."""
+        with suppress(InvalidStateError):
+            self.applied.set_result(applied)
 
 
 class Builds(NamedTuple):
@@ -70,6 +98,7 @@ class BodyUploads:
     leaving: the factor in use before, and the number of steps after whose completion no step reads it
     posted: not taken by the loop yet, in this mail
     building: in the thread of the plans, with others
+    built: prepared, and the factor that it is of, which is neither posted nor dropped yet
     queued: a factor that waits for a storage, or for that thread
     warned: True after the first factor that could not be used
     """
@@ -82,13 +111,14 @@ class BodyUploads:
     posted: UploadedFactor | None = None
     mail: Mail | None = None
     building: Builds | None = None
+    built: tuple[UploadedFactor, GivenFactor] | None = None
     queued: GivenFactor | None = None
     warned: bool = False
 
     @property
     def free(self) -> bool:
         """True if a build may begin: a storage is free, or will be made."""
-        return self.posted is None and self.leaving is None and self.building is None
+        return self.posted is None and self.leaving is None and self.building is None and self.built is None
 
     def patterns(self, body: int) -> set[int]:
         """Ids of the patterns whose plans are needed. body: number of this one"""
@@ -124,16 +154,79 @@ class FactorUpload:
         Returns at once: what takes long, plans and large factors, is done beside the caller. The values must not change
         any more.
         """
-        self.post_many([(body, pattern, values, step)])
+        with self._lock:
+            self._refresh(body)
+            if not self._use_prepared(body, values):
+                self._enqueue(body, GivenFactor(pattern, values, step))
+                self._begin_queued([body])
+
+    def prepare(
+        self, body: int, pattern: FactorPattern, values: NDArray[Any], step: int, r: Float64
+    ) -> "Future[Applied | None]":  # fmt: skip
+        """Builds the inverse of a factor, beside the caller, and applies it to r (n,); it is used once these very
+        values are posted. Returns P^-1 r; None as its result if it comes to nothing."""
+        given = GivenFactor(pattern, values, step, r, wanted=False)
+        with self._lock:
+            self._refresh(body)
+            self._enqueue(body, given)
+            self._begin_queued([body], beside=True)
+        return given.applied
+
+    def drop(self, body: int, values: NDArray[Any]) -> None:
+        """Gives up a factor that was prepared and not posted; any other one is let alone."""
+        with self._lock:
+            uploads = self._uploads[body]
+            self._refresh(body)
+            given = self._prepared(body, values)
+            if given is None:
+                return
+            given.drop()
+            if uploads.built is not None and uploads.built[1] is given:
+                uploads.built = None
+            if uploads.queued is given:
+                uploads.queued = None
+            self._begin_queued([body])
+
+    def _prepared(self, body: int, values: NDArray[Any]) -> GivenFactor | None:
+        """Returns the factor with these values that is prepared and not posted."""
+        uploads = self._uploads[body]
+        building = None if uploads.building is None else uploads.building.given[body]
+        coming = (uploads.queued, building, None if uploads.built is None else uploads.built[1])
+        return next((each for each in coming if each is not None and not each.wanted and each.values is values), None)
+
+    def _use_prepared(self, body: int, values: NDArray[Any]) -> bool:
+        """Has a prepared factor used, at once if it is built; False if there is none with these values."""
+        uploads = self._uploads[body]
+        given = self._prepared(body, values)
+        if given is None:
+            return False
+        given.wanted = True
+        if uploads.built is not None and uploads.built[1] is given:
+            (factor, _), uploads.built = uploads.built, None
+            self._post(body, given, factor)
+        return True
+
+    def _enqueue(self, body: int, given: GivenFactor) -> None:
+        """Puts a factor in the place of the one that waits, or that waits to be posted."""
+        uploads = self._uploads[body]
+        if uploads.queued is not None:
+            uploads.queued.drop()
+        if uploads.built is not None:
+            uploads.built[1].drop()
+            uploads.built = None
+        uploads.queued = given
 
     def post_many(self, given: Sequence[tuple[int, FactorPattern, NDArray[Any], int]]) -> None:
         """Takes factors of different bodies, each as `post` takes one. Inverses of many are built beside the caller,
         who would wait for one after another, those of one plan together."""
         with self._lock:
+            waiting = []
             for body, pattern, values, step in given:
                 self._refresh(body)
-                self._uploads[body].queued = GivenFactor(pattern, values, step)
-            self._begin_queued([body for body, *_ in given])
+                if not self._use_prepared(body, values):
+                    self._enqueue(body, GivenFactor(pattern, values, step))
+                    waiting.append(body)
+            self._begin_queued(waiting)
 
     def advance(self) -> None:
         """Posts what was built beside the caller, and begins the builds that have waited for a storage."""
@@ -158,6 +251,7 @@ class FactorUpload:
             uploads = self._uploads[body]
             self._refresh(body)
             if uploads.queued is not None and uploads.building is None:
+                uploads.built = None
                 if uploads.posted is not None and uploads.mailbox.withdraw():
                     uploads.posted.inverse.event.synchronize()  # its storage may be reused
                     uploads.posted = uploads.mail = None
@@ -189,25 +283,25 @@ class FactorUpload:
         if uploads.leaving is not None and self._loop.step >= uploads.leaving[1]:
             uploads.leaving = None
 
-    def _begin_queued(self, bodies: Sequence[int]) -> None:
+    def _begin_queued(self, bodies: Sequence[int], beside: bool = False) -> None:
         """Begins to build the queued factors of some bodies that need not wait: at once if they are few, small and
-        planned, else in the thread of the plans."""
-        beside: dict[Future[PlannedInverse], list[int]] = {}
+        planned and not `beside`, else in the thread of the plans."""
+        later: dict[Future[PlannedInverse], list[int]] = {}
         for body in bodies:
             uploads = self._uploads[body]
             if uploads.queued is not None and uploads.free:
                 plan = self._solver.begin_plan(body, uploads.queued.pattern)
                 small = uploads.queued.values.nbytes <= SMALL
-                if plan.done() and small and len(bodies) < MANY:
+                if plan.done() and small and len(bodies) < MANY and not beside:
                     given, uploads.queued = uploads.queued, None
-                    self._post(body, given.pattern, self._build(plan, [(body, given, self._spare(uploads, given))])[0])
+                    self._post(body, given, self._build(plan, [(body, given, self._spare(uploads, given))])[0])
                 else:
-                    beside.setdefault(plan, []).append(body)
+                    later.setdefault(plan, []).append(body)
             if uploads.queued is None:
                 self._waiting.discard(body)
             else:
                 self._waiting.add(body)
-        for plan, waiting in beside.items():
+        for plan, waiting in later.items():
             first = self._uploads[waiting[0]].queued
             most = TOGETHER if first is not None and first.values.nbytes <= SMALL else 1
             for k in range(0, len(waiting), most):
@@ -237,9 +331,16 @@ class FactorUpload:
         """Begins to build inverses of factors of one plan, which is made, each in a storage, a new one unless there is
         one to spare."""
         try:
-            planned = plan.result()
+            return self._built(plan.result(), work)
         except Exception as error:
             return [error for _ in work]
+        finally:
+            for _, given, _ in work:
+                given.tell(None)
+
+    def _built(
+        self, planned: PlannedInverse, work: Sequence[tuple[int, GivenFactor, InverseStorage | None]]
+    ) -> list[UploadedFactor | Exception]:  # fmt: skip
         made: list[UploadedFactor | Exception | None] = [None] * len(work)
         storages: dict[int, InverseStorage] = {}  # by place
         for place, (body, _, spare) in enumerate(work):
@@ -260,17 +361,29 @@ class FactorUpload:
         storages: dict[int, InverseStorage], made: list[UploadedFactor | Exception | None],
     ) -> None:  # fmt: skip
         """Fills in what is made at some places, beside the steps."""
-        given = [work[place][1] for place in storages]
+        given, multiprocessors = [work[place][1] for place in storages], self._multiprocessors
         try:
             inverses = planned.builder.build_many(
-                [each.values for each in given], list(storages.values()), self._solver.spared
+                [each.values for each in given], list(storages.values()), multiprocessors
             )
+            for each, inverse in zip(given, inverses, strict=True):
+                if each.r is not None:
+                    each.tell(planned.builder.apply(inverse, each.r, multiprocessors))
         except Exception as error:
             for place in storages:
                 made[place] = error
             return
         for (place, storage), each, inverse in zip(storages.items(), given, inverses, strict=True):
             made[place] = UploadedFactor(inverse, storage, each.step, each.pattern)
+
+    @property
+    def _multiprocessors(self) -> int | None:
+        """Multiprocessors that a build may keep busy: those that solves leave free; None: all, where steps in real time
+        leave the device idle most of the time. A step then waits some 100 us now and then, and the build is done the
+        sooner."""
+        loop = self._loop.loop
+        idle = loop.realtime and 0 < loop.step_seconds < BUSY * loop.dt
+        return None if idle else self._solver.spared
 
     def _finish(self, builds: Builds) -> None:
         """Posts what was built beside the caller."""
@@ -280,20 +393,24 @@ class FactorUpload:
         errors = []
         for (body, given), made in zip(builds.given.items(), builds.made.result(), strict=True):
             try:
-                self._post(body, given.pattern, made)
+                self._post(body, given, made)
             except Exception as error:  # the others are posted all the same
                 errors.append(error)
         if errors:
             raise errors[0]
 
-    def _post(self, body: int, pattern: FactorPattern, made: UploadedFactor | Exception) -> None:
-        """Posts a factor, or warns if it cannot be used. Raises what is neither of the factor nor lack of memory."""
+    def _post(self, body: int, given: GivenFactor, made: UploadedFactor | Exception) -> None:
+        """Posts a factor, if it is wanted already, or warns if it cannot be used. Raises what is neither of the factor
+        nor lack of memory."""
         uploads = self._uploads[body]
         try:
             if isinstance(made, Exception):
                 raise made
             self._keep(uploads, made)
-            self._solver.use(body, pattern, made.inverse, made.step)
+            if not given.wanted:
+                uploads.built = None if given.dropped else (made, given)
+                return
+            self._solver.use(body, given.pattern, made.inverse, made.step)
         except (ValueError, CompileError) as error:
             self._warn(uploads, str(error))
             return

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Builds the partitioned inverse (plan.py) from the values of L on the device, beside the running steps.
 
-A build, of one factor or of several, is one copy from pinned memory and one launch of a graph of the kernels in
+A build, of one factor or of several, is a copy or two from pinned memory and one launch of a graph of the kernels in
 build_inverse.cu. Memory is allocated only when an InverseBuilder or an InverseStorage is made.
 """
 
@@ -12,8 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from protocol.factor import FactorPattern
+from sim_server.arrays import Float64
 from sim_server.backends.gpu.cupy_types import DeviceArray, Event, Graph, KernelFunction
 from sim_server.backends.gpu.device import Gpu, no_memory_left
+from sim_server.backends.gpu.inverse.apply_inverse import Applied, InverseApplication, application_kernels
 from sim_server.backends.gpu.inverse.expansion_batches import (
     BUILDS,
     COLUMN,
@@ -28,6 +30,7 @@ from sim_server.backends.gpu.inverse.expansion_batches import (
 from sim_server.backends.gpu.inverse.partition import COLUMNS, ROWS
 from sim_server.backends.gpu.inverse.plan import Plan
 from sim_server.backends.gpu.inverse.workspace import workspace
+from sim_server.backends.gpu.pinned import PinnedArray
 
 HEAD = BUILDS.itemsize  # bytes in front of the values: struct Builds
 COUNTS = (1, 4, 16, MOST_BUILDS)  # of inverses, for which graphs are made
@@ -45,7 +48,8 @@ KERNELS: dict[str, Groups] = {
 
 
 def builder_kernels(gpu: Gpu) -> dict[str, KernelFunction]:
-    """Returns the kernels of build_inverse.cu by name, compiled. Raises CompileError."""
+    """Returns the kernels of build_inverse.cu by name, compiled, as is what applies inverses. Raises CompileError."""
+    application_kernels(gpu)
     return {name: gpu.module("backends/gpu/inverse/build_inverse.cu").function(name) for name in KERNELS}
 
 
@@ -87,6 +91,7 @@ class InverseBuilder:
         self._workspace = workspace(cp.cuda.Device().id)
         self.most = self._reserve(max(1, min(most, MOST_BUILDS, WORKSPACE // layout.size)))
         self._functions = builder_kernels(gpu)
+        self._application: InverseApplication | None = None
         self._graphs: dict[tuple[int | None, int], Graph] = {}
         self._generation = -1
         cp.cuda.get_current_stream().synchronize()  # the tables are there for the stream of builds, which does not wait
@@ -131,6 +136,14 @@ class InverseBuilder:
         with self._workspace.lock:
             return self._begin(values, storages, multiprocessors)
 
+    def apply(self, inverse: PartitionedInverse, r: Float64, multiprocessors: int | None = None) -> Applied:
+        """Begins to apply an inverse that a build under way makes to r (n,); returns before it is complete."""
+        with self._workspace.lock:
+            if self._application is None:
+                self._application = InverseApplication(self._gpu, self.plan)
+            most = multiprocessors or self._gpu.properties["multiProcessorCount"]
+            return self._application.begin(inverse.matrix, inverse.scale, r, self._workspace.stream, most)
+
     def _begin(
         self, values: Sequence[NDArray[np.floating]], storages: Sequence[InverseStorage], multiprocessors: int | None
     ) -> list[PartitionedInverse]:  # fmt: skip
@@ -142,14 +155,18 @@ class InverseBuilder:
         head["count"] = count
         targets = [(s.matrix.data.ptr, s.scale.data.ptr) for s in storages]
         head["targets"][:count] = np.array(targets, np.uint64).view(INVERSE_STORAGE).ravel()
-        size = HEAD + 4 * count * self._nonzeros
-        for row, factor in zip(space.staging[HEAD:size].view(np.float32).reshape(count, -1), values, strict=True):
-            np.copyto(row, factor, casting="same_kind")
+        size, first = HEAD + 4 * count * self._nonzeros, values[0]
         graph, stream = self._graph(multiprocessors, next(c for c in COUNTS if c >= count)), space.stream
-        cp.cuda.runtime.memcpyAsync(
-            space.incoming.data.ptr, space.staging.ctypes.data, size, cp.cuda.runtime.memcpyHostToDevice, stream.ptr
-        )
-        space.copied = stream.record()
+        at, copy, kind = int(space.incoming.data.ptr), cp.cuda.runtime.memcpyAsync, cp.cuda.runtime.memcpyHostToDevice
+        pinned = isinstance(first, PinnedArray) and first.dtype == np.float32 and first.flags.c_contiguous
+        if count == 1 and pinned:
+            copy(at, space.staging.ctypes.data, HEAD, kind, stream.ptr)
+            copy(at + HEAD, first.ctypes.data, size - HEAD, kind, stream.ptr)
+        else:
+            for row, factor in zip(space.staging[HEAD:size].view(np.float32).reshape(count, -1), values, strict=True):
+                np.copyto(row, factor, casting="same_kind")
+            copy(at, space.staging.ctypes.data, size, kind, stream.ptr)
+        space.copied, space.source = stream.record(), first
         graph.launch(stream)
         done = stream.record()
         return [PartitionedInverse(*addresses, done) for addresses in targets]
