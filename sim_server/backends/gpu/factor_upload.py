@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: MIT
 """Upload of factors: a partitioned inverse is built beside the steps, then posted into the mailbox of the body.
 
-Each body has two storages per pattern (double buffering). A build begins once the inverse before it is in use and no
-step under way reads the other storage. A factor that arrives earlier is queued; a newer one replaces it. Plans, made
-once per pattern, and the copies of large factors, or of many, are left to a thread (PcgSolver.beside), for which the
-thread that serves the loop does not wait. Many small ones of one plan are built together.
+Each body has two storages per pattern and number of binary digits (double buffering). A build begins once the inverse
+before it is in use and no step under way reads the other storage. A factor that arrives earlier is queued; a newer one
+replaces it. Plans, made once per pattern, and the copies of large factors, or of many, are left to a thread
+(PcgSolver.beside), for which the thread that serves the loop does not wait. Many small ones of one
+plan are built together.
 
 A factor may be *prepared* while it is checked: its inverse is built, applied once for the check, and kept out of use
 until the factor is posted, or dropped.
@@ -12,7 +13,7 @@ until the factor is posted, or dropped.
 
 import logging
 import threading
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import Future, InvalidStateError, wait
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -38,16 +39,28 @@ SMALL = 1 << 20  # bytes of a factor that is copied at once
 MANY = 4  # small factors that come together, from which on none is built at once
 TOGETHER = 64  # factors of one plan that are handed over together
 BUSY = 0.25  # share of dt that steps in real time take, up to which builds may have the whole device
-MAX_PATTERNS = 2  # of a body at a time; workers with different libraries send different patterns
+MAX_KINDS = 2  # of inverses of a body at a time; workers with different libraries send different patterns
+InverseKind = tuple[int, int]
+"""Of inverses: id of the pattern, float16 numbers per entry."""
 
 
 class UploadedFactor(NamedTuple):
-    """A factor on the device, complete once the event of its inverse is. step: of the matrix it was made from."""
+    """A factor on the device, complete once the event of its inverse is.
+
+    step: of the matrix it was made from
+    planes: float16 numbers per entry
+    """
 
     inverse: PartitionedInverse
     storage: InverseStorage
     step: int
     pattern: FactorPattern
+    planes: int
+
+    @property
+    def kind(self) -> InverseKind:
+        """Of its inverse."""
+        return self.pattern.id, self.planes
 
 
 @dataclass(eq=False)
@@ -79,8 +92,22 @@ class GivenFactor:
             self.applied.set_result(applied)
 
 
+class ChosenPlan(NamedTuple):
+    """What the inverse of a factor is built by.
+
+    planes: float16 numbers per entry
+    spare: a storage that no step reads; None: one is to be made
+    """
+
+    body: int
+    given: GivenFactor
+    planes: int
+    plan: Future[PlannedInverse]
+    spare: InverseStorage | None
+
+
 class Builds(NamedTuple):
-    """Inverses of factors of one plan that are built beside the caller.
+    """Inverses that are built beside the caller.
 
     given: by body
     made: of each, in this order, or why there is none
@@ -94,7 +121,8 @@ class Builds(NamedTuple):
 class BodyUploads:
     """Factors of one body.
 
-    storages: by id of the pattern
+    planes: float16 numbers per entry of the last factor's inverse, or of the first one's as expected
+    storages: by kind
     leaving: the factor in use before, and the number of steps after whose completion no step reads it
     posted: not taken by the loop yet, in this mail
     building: in the thread of the plans, with others
@@ -105,7 +133,8 @@ class BodyUploads:
 
     name: str
     mailbox: DeviceMailbox
-    storages: dict[int, list[InverseStorage]] = field(default_factory=dict)
+    planes: int
+    storages: dict[InverseKind, list[InverseStorage]] = field(default_factory=dict)
     in_use: UploadedFactor | None = None
     leaving: tuple[UploadedFactor, int] | None = None
     posted: UploadedFactor | None = None
@@ -120,10 +149,10 @@ class BodyUploads:
         """True if a build may begin: a storage is free, or will be made."""
         return self.posted is None and self.leaving is None and self.building is None and self.built is None
 
-    def patterns(self, body: int) -> set[int]:
-        """Ids of the patterns whose plans are needed. body: number of this one"""
+    def kinds(self, body: int) -> set[InverseKind]:
+        """Kinds of inverses whose plans are needed, or may be. body: number of this one"""
         coming = [given for given in (self.queued, self.building and self.building.given[body]) if given]
-        return {*self.storages, *(given.pattern.id for given in coming)}
+        return {*self.storages, *((given.pattern.id, planes) for given in coming for planes in (1, 2))}
 
 
 class FactorUpload:
@@ -138,11 +167,12 @@ class FactorUpload:
         self, gpu: Gpu, solver: PcgSolver, loop: DeviceLoop, names: Sequence[str], mailboxes: Sequence[DeviceMailbox]
     ):
         self._gpu, self._solver, self._loop = gpu, solver, loop
-        self._uploads = [BodyUploads(name, box) for name, box in zip(names, mailboxes, strict=True)]
+        planes = solver.planes or 1
+        self._uploads = [BodyUploads(name, box, planes) for name, box in zip(names, mailboxes, strict=True)]
         self._lock = threading.RLock()
         self._waiting: set[int] = set()  # bodies with a queued factor
         self._builds: list[Builds] = []  # under way beside the caller
-        self._known: set[int] = set()  # ids of patterns that storages were made for
+        self._known: set[InverseKind] = set()  # of which storages were made
 
     def expect(self, body: int, pattern: FactorPattern) -> None:
         """Begins to plan the inverses of factors of a pattern, beside the caller."""
@@ -286,95 +316,122 @@ class FactorUpload:
     def _begin_queued(self, bodies: Sequence[int], beside: bool = False) -> None:
         """Begins to build the queued factors of some bodies that need not wait: at once if they are few, small and
         planned and not `beside`, else in the thread of the plans."""
-        later: dict[Future[PlannedInverse], list[int]] = {}
+        small: list[int] = []
         for body in bodies:
             uploads = self._uploads[body]
-            if uploads.queued is not None and uploads.free:
-                plan = self._solver.begin_plan(body, uploads.queued.pattern)
-                small = uploads.queued.values.nbytes <= SMALL
-                if plan.done() and small and len(bodies) < MANY and not beside:
-                    given, uploads.queued = uploads.queued, None
-                    self._post(body, given, self._build(plan, [(body, given, self._spare(uploads, given))])[0])
-                else:
-                    later.setdefault(plan, []).append(body)
-            if uploads.queued is None:
-                self._waiting.discard(body)
+            if uploads.queued is None or not uploads.free:
+                (self._waiting.discard if uploads.queued is None else self._waiting.add)(body)
+            elif uploads.queued.values.nbytes > SMALL or beside:
+                self._begin_beside([body])
+            elif len(bodies) < MANY:
+                self._begin_now(body)
             else:
-                self._waiting.add(body)
-        for plan, waiting in later.items():
-            first = self._uploads[waiting[0]].queued
-            most = TOGETHER if first is not None and first.values.nbytes <= SMALL else 1
-            for k in range(0, len(waiting), most):
-                self._begin_beside(plan, waiting[k : k + most])
+                small.append(body)
+        for k in range(0, len(small), TOGETHER):
+            self._begin_beside(small[k : k + TOGETHER])
 
-    def _begin_beside(self, plan: Future[PlannedInverse], bodies: Sequence[int]) -> None:
-        work = []
-        for body in bodies:
-            uploads = self._uploads[body]
-            given, uploads.queued = uploads.queued, None
-            assert given is not None
-            work.append((body, given, self._spare(uploads, given)))
-            self._waiting.discard(body)
-        builds = Builds({body: given for body, given, _ in work}, self._solver.beside(partial(self._build, plan, work)))
+    def _take_queued(self, body: int) -> tuple[int, GivenFactor, Mapping[InverseKind, InverseStorage | None]]:
+        """Takes the queued factor of a body, with the storages that no step reads."""
+        uploads = self._uploads[body]
+        given, uploads.queued = uploads.queued, None
+        assert given is not None
+        self._waiting.discard(body)
+        used = uploads.in_use.storage if uploads.in_use else None
+        spare = {kind: next((s for s in made if s is not used), None) for kind, made in uploads.storages.items()}
+        return body, given, spare
+
+    def _begin_now(self, body: int) -> None:
+        chosen = self._chosen(*self._take_queued(body))
+        if chosen.plan.done():
+            self._post(body, chosen.given, self._build([chosen])[0])
+        else:
+            builds = self._note([chosen.given], [body])
+            self._solver.beside(partial(self._end, [chosen], builds.made))
+
+    def _begin_beside(self, bodies: Sequence[int]) -> None:
+        work = [self._take_queued(body) for body in bodies]
+        builds = self._note([given for _, given, _ in work], bodies)
+        self._solver.beside(partial(self._choose_and_build, work, builds.made))
+
+    def _note(self, given: Sequence[GivenFactor], bodies: Sequence[int]) -> Builds:
+        builds = Builds(dict(zip(bodies, given, strict=True)), Future())
         for body in bodies:
             self._uploads[body].building = builds
         self._builds.append(builds)
+        return builds
 
-    def _spare(self, uploads: BodyUploads, given: GivenFactor) -> InverseStorage | None:
-        """Returns a storage that no step reads; None: one is to be made."""
-        used = uploads.in_use.storage if uploads.in_use else None
-        return next((s for s in uploads.storages.get(given.pattern.id, []) if s is not used), None)
+    def _chosen(
+        self, body: int, given: GivenFactor, spare: Mapping[InverseKind, InverseStorage | None]
+    ) -> ChosenPlan:  # fmt: skip
+        """Chooses how many digits an inverse needs, and begins its plan."""
+        planes = self._solver.planes_for(given.pattern, given.values)
+        plan = self._solver.begin_plan(body, given.pattern, planes)
+        return ChosenPlan(body, given, planes, plan, spare.get((given.pattern.id, planes)))
 
-    def _build(
-        self, plan: Future[PlannedInverse], work: Sequence[tuple[int, GivenFactor, InverseStorage | None]]
-    ) -> list[UploadedFactor | Exception]:  # fmt: skip
-        """Begins to build inverses of factors of one plan, which is made, each in a storage, a new one unless there is
-        one to spare."""
+    def _choose_and_build(
+        self, work: Sequence[tuple[int, GivenFactor, Mapping[InverseKind, InverseStorage | None]]],
+        made: Future[list[UploadedFactor | Exception]],
+    ) -> None:  # fmt: skip
+        """Begins to build inverses, in the thread of the plans: now, or behind their plans."""
         try:
-            return self._built(plan.result(), work)
+            chosen = [self._chosen(*each) for each in work]
         except Exception as error:
-            return [error for _ in work]
-        finally:
             for _, given, _ in work:
                 given.tell(None)
+            made.set_result([error for _ in work])
+            return
+        if all(each.plan.done() for each in chosen):
+            self._end(chosen, made)
+        else:
+            self._solver.beside(partial(self._end, chosen, made))
 
-    def _built(
-        self, planned: PlannedInverse, work: Sequence[tuple[int, GivenFactor, InverseStorage | None]]
-    ) -> list[UploadedFactor | Exception]:  # fmt: skip
-        made: list[UploadedFactor | Exception | None] = [None] * len(work)
+    def _end(self, chosen: Sequence[ChosenPlan], made: Future[list[UploadedFactor | Exception]]) -> None:
+        try:
+            made.set_result(self._build(chosen))
+        except BaseException as error:
+            made.set_exception(error)
+
+    def _build(self, chosen: Sequence[ChosenPlan]) -> list[UploadedFactor | Exception]:
+        """Begins to build inverses whose plans are made, those of one plan together."""
+        made: list[UploadedFactor | Exception] = [ValueError("not built")] * len(chosen)
+        try:
+            for plan in dict.fromkeys(each.plan for each in chosen):
+                places = [place for place, each in enumerate(chosen) if each.plan is plan]
+                try:
+                    self._build_by(plan.result(), chosen, places, made)
+                except Exception as error:
+                    for place in places:
+                        made[place] = error
+        finally:
+            for each in chosen:
+                each.given.tell(None)
+        return made
+
+    def _build_by(
+        self, planned: PlannedInverse, chosen: Sequence[ChosenPlan], places: Sequence[int],
+        made: list[UploadedFactor | Exception],
+    ) -> None:  # fmt: skip
+        """Fills in what is made at some places, each in a storage, a new one unless there is one to spare."""
         storages: dict[int, InverseStorage] = {}  # by place
-        for place, (body, _, spare) in enumerate(work):
+        for place in places:
             try:
-                storages[place] = planned.builder.storage() if spare is None else spare
-                self._solver.reserve_vectors(body, planned.plan)
+                spare = chosen[place].spare
+                storage = planned.builder.storage() if spare is None else spare
+                self._solver.reserve_vectors(chosen[place].body, planned.plan)
+                storages[place] = storage
             except Exception as error:
-                storages.pop(place, None)
                 made[place] = error
         self._gpu.cp.cuda.get_current_stream().synchronize()  # new arrays are complete for other streams
-        places, most = list(storages), planned.builder.most
-        for k in range(0, len(places), most):
-            self._build_some(planned, work, {p: storages[p] for p in places[k : k + most]}, made)
-        return [each for each in made if each is not None]
-
-    def _build_some(
-        self, planned: PlannedInverse, work: Sequence[tuple[int, GivenFactor, Any]],
-        storages: dict[int, InverseStorage], made: list[UploadedFactor | Exception | None],
-    ) -> None:  # fmt: skip
-        """Fills in what is made at some places, beside the steps."""
-        given, multiprocessors = [work[place][1] for place in storages], self._multiprocessors
-        try:
-            inverses = planned.builder.build_many(
-                [each.values for each in given], list(storages.values()), multiprocessors
-            )
-            for each, inverse in zip(given, inverses, strict=True):
-                if each.r is not None:
-                    each.tell(planned.builder.apply(inverse, each.r, multiprocessors))
-        except Exception as error:
-            for place in storages:
-                made[place] = error
-            return
-        for (place, storage), each, inverse in zip(storages.items(), given, inverses, strict=True):
-            made[place] = UploadedFactor(inverse, storage, each.step, each.pattern)
+        builder, able, multiprocessors = planned.builder, list(storages), self._multiprocessors
+        for k in range(0, len(able), builder.most):
+            some = able[k : k + builder.most]
+            values = [chosen[place].given.values for place in some]
+            inverses = builder.build_many(values, [storages[place] for place in some], multiprocessors)
+            for place, inverse in zip(some, inverses, strict=True):
+                given, planes = chosen[place].given, chosen[place].planes
+                if given.r is not None:
+                    given.tell(builder.apply(inverse, given.r, multiprocessors))
+                made[place] = UploadedFactor(inverse, storages[place], given.step, given.pattern, planes)
 
     @property
     def _multiprocessors(self) -> int | None:
@@ -410,7 +467,7 @@ class FactorUpload:
             if not given.wanted:
                 uploads.built = None if given.dropped else (made, given)
                 return
-            self._solver.use(body, given.pattern, made.inverse, made.step)
+            self._solver.use(body, given.pattern, made.inverse, made.planes, made.step)
         except (ValueError, CompileError) as error:
             self._warn(uploads, str(error))
             return
@@ -419,28 +476,35 @@ class FactorUpload:
                 raise
             self._warn(uploads, f"not enough GPU memory: {error}")
             return
+        self._tell(uploads, made.planes)
         uploads.posted = made
         row = self._solver.bodies[body : body + 1].tobytes()[SETTINGS_BYTES:]
         uploads.mail = uploads.mailbox.post(row, keep=made, event=made.inverse.event.ptr)
 
     def _keep(self, uploads: BodyUploads, factor: UploadedFactor) -> None:
-        """Keeps the storage of a factor, and forgets those of patterns that are not used any more."""
-        if factor.pattern.id not in uploads.storages:
-            in_use = uploads.in_use.pattern.id if uploads.in_use else None
+        """Keeps the storage of a factor, and forgets those of kinds that are not used any more."""
+        if factor.kind not in uploads.storages:
+            in_use = uploads.in_use.kind if uploads.in_use else None
             outdated = [k for k in uploads.storages if k != in_use]
             for old in outdated:
-                if len(uploads.storages) >= MAX_PATTERNS:
+                if len(uploads.storages) >= MAX_KINDS:
                     del uploads.storages[old]
-            if outdated or factor.pattern.id not in self._known:
-                self._forget_plans(factor.pattern.id)
-        storages = uploads.storages.setdefault(factor.pattern.id, [])
+            if outdated or factor.kind not in self._known:
+                self._forget_plans(factor.kind)
+        storages = uploads.storages.setdefault(factor.kind, [])
         if all(storage is not factor.storage for storage in storages):
             storages.append(factor.storage)
 
-    def _forget_plans(self, needed: int) -> None:
-        """Forgets the plans of patterns that no body has. needed: id of one that is about to be used"""
-        self._known = {needed}.union(*(each.patterns(body) for body, each in enumerate(self._uploads)))
+    def _forget_plans(self, needed: InverseKind) -> None:
+        """Forgets the plans of kinds that no body has. needed: one that is about to be used"""
+        self._known = {needed}.union(*(each.kinds(body) for body, each in enumerate(self._uploads)))
         self._solver.forget_plans(self._known)
+
+    def _tell(self, uploads: BodyUploads, planes: int) -> None:
+        """Takes note of how many digits the inverse of a factor has, and logs it where that changes."""
+        if planes != uploads.planes:
+            uploads.planes = planes
+            log.info("object %r: its factors keep %d binary digits on the GPU from now on", uploads.name, 11 * planes)
 
     def _warn(self, uploads: BodyUploads, reason: str) -> None:
         if not uploads.warned:
