@@ -25,7 +25,7 @@ from protocol.messages_pb2 import Factor
 from protocol.method import Method
 from protocol.process.exhausted import exhausted
 from protocol.refused import Refused
-from protocol.validate import array, checksum
+from protocol.validate import array, checksum, copied
 
 log = logging.getLogger(__name__)
 
@@ -319,13 +319,14 @@ class Worker:
         payload = b""
         if pattern is not None and values is not None:
             answer.pattern, answer.nonzeros = pattern.id, pattern.nonzeros
-            in_slot = self._into_slot(message, answer, values)
-            if not in_slot and 0 < WHOLE_PARTS * message.part_bytes < values.nbytes:
+            if self._into_slot(message, answer, values):
+                pass
+            elif 0 < WHOLE_PARTS * message.part_bytes < values.nbytes:
                 number, size = message.header.sequence, message.part_bytes
                 answer.parts.extend(connection.offered.offer(job.object, answer.header, number, values, size))
             else:
                 answer.checksum = checksum(values)
-                payload = b"" if in_slot else values.tobytes()
+                payload = values.tobytes()
         connection.send_factor(answer, payload)
         if values is not None:
             self._counters.add("factors")
@@ -356,13 +357,14 @@ class Worker:
                 self._counters.trouble("unsent", f"factors were not sent: {error}")
 
     def _into_slot(self, message: Any, answer: Factor, values: NDArray[Any]) -> bool:
-        """Writes the values into the slot lent for them; returns False if there is none that is large enough."""
+        """Writes the values into the slot lent for them, and their checksum into the answer; returns False if there is
+        no slot that is large enough."""
         if not message.HasField("factor_slot") or message.factor_slot.capacity < values.nbytes:
             return False
         slot = message.factor_slot
         target = self._connection.slots.array(slot, values.dtype, values.size)
         if not self._connection.slots.is_current(slot):
             raise Refused("the slot for the factor was lent to somebody else: this answer is late", "late")
-        np.copyto(target, values)
+        answer.checksum, _ = copied(values, target, own=values)
         answer.slot.CopyFrom(slot)
         return True

@@ -21,3 +21,8 @@ def free_port() -> int:
                 continue
             return FIRST + number % COUNT
     raise OSError(f"no free port from {FIRST} to {FIRST + COUNT - 1}")
+
+
+def free_endpoint(host: str = "127.0.0.1", protocol: str = "tcp") -> str:
+    """An endpoint of such a port."""
+    return f"{protocol}/{host}:{free_port()}"

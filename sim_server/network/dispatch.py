@@ -29,7 +29,7 @@ from sim_server.network.worker_choice import WorkerChoice
 from sim_server.network.worker_registry import WorkerRegistry
 from sim_server.network.worker_reliability import WorkerReliability
 from sim_server.network.worker_timing import WorkerTiming
-from sim_server.updates.factor_source import FactorSource, Job
+from sim_server.updates.factor_source import FactorMemory, FactorSource, Job
 
 log = logging.getLogger(__name__)
 
@@ -150,6 +150,10 @@ class Dispatch(FactorSource):
         with self._lock:
             failures, self._book.failures = self._book.failures, []
             return failures
+
+    def use_memory(self, memory: FactorMemory) -> None:
+        """Has large factors that arrive put into arrays that `memory` makes."""
+        self.decoder.memory = memory
 
     def worker_count(self) -> int:
         """Number of workers that may be given jobs, idle or busy."""

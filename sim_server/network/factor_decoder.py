@@ -14,10 +14,12 @@ from protocol.messages_pb2 import FactorBatch, Topology
 from protocol.messages_pb2 import FactorPattern as PatternMessage
 from protocol.messages_pb2 import Slot as SlotMessage
 from protocol.refused import Refused
-from protocol.validate import Sized, array, check_header, check_numbers, check_strings, parse, take
+from protocol.validate import Sized, array, check_header, check_numbers, check_strings, copied, parse, take
 from sim_server.arrays import Float32, Float64
 from sim_server.network.leases import InFlightJob
+from sim_server.updates.factor_source import FactorMemory
 
+LARGE = 1 << 20  # bytes of a factor for which `memory` is asked
 MAX_PATTERNS = 4  # kept per object: one for each library among its workers
 
 
@@ -39,10 +41,14 @@ class AnnouncedObject:
 
 
 class FactorDecoder:
-    """Decodes messages of workers about objects that were announced. Its methods raise Refused."""
+    """Decodes messages of workers about objects that were announced. Its methods raise Refused.
+
+    memory: makes the arrays that large factors are copied to (FactorSource.use_memory)
+    """
 
     def __init__(self, incarnation: int):
         self._incarnation = incarnation
+        self.memory: FactorMemory = np.empty
         self.objects: dict[str, AnnouncedObject] = {}
         self._most_blocks = 0
         self._unsized: set[str] = set()  # objects that have had no factor in this epoch
@@ -115,9 +121,11 @@ class FactorDecoder:
             raise Refused(f"Factor.nonzeros is {message.nonzeros}; allowed: {pattern.nonzeros}", "shape")
         if fetch is not None:
             return self._factor(pattern, fetch(), None, job, message.seconds, message.remedy)
-        in_slot = message.HasField("slot")
-        values = _from_slot(message.slot, message.nonzeros, job) if in_slot else _from_payload(message, payload)
-        return self._factor(pattern, values, message.checksum, job, message.seconds, message.remedy)
+        if message.HasField("slot"):
+            values, seen = self._from_slot(message.slot, message.nonzeros, job)
+        else:
+            values, seen = _from_payload(message, payload), None
+        return self._factor(pattern, values, message.checksum, job, message.seconds, message.remedy, seen)
 
     def parse_batch(self, key: object, attachment: Sized | None) -> FactorBatch:
         """Parses a message with answers to several jobs. Each answer is checked by itself, in `decode_one`."""
@@ -145,9 +153,9 @@ class FactorDecoder:
             raise Refused(f"FactorBatch.patterns has {message.patterns[place]:016x}, which was not sent", "pattern")
         if nonzeros != pattern.nonzeros:
             raise Refused(f"FactorBatch.nonzeros has {nonzeros}; allowed: {pattern.nonzeros}", "shape")
-        values = _from_slot(message.slot, nonzeros, job)
+        values, seen = self._from_slot(message.slot, nonzeros, job)
         remedy = message.remedies[place] if message.remedies else ""
-        return self._factor(pattern, values, message.checksums[place], job, seconds, remedy)
+        return self._factor(pattern, values, message.checksums[place], job, seconds, remedy, seen)
 
     def decode_several(
         self, message: FactorBatch, answers: Sequence[tuple[int, InFlightJob]]
@@ -163,34 +171,37 @@ class FactorDecoder:
 
     def _factor(
         self, pattern: FactorPattern, values: Float32 | Float64, checksum: int | None, job: InFlightJob,
-        seconds: float, remedy: str,
+        seconds: float, remedy: str, seen: tuple[int, bool] | None = None,
     ) -> Factor:  # fmt: skip
-        check_values(values, pattern, checksum)
+        check_values(values, pattern, checksum, seen)
         largest = self.objects[job.object].largest
         largest[job.method] = max(largest.get(job.method, 0), pattern.nonzeros)
         self._unsized.discard(job.object)
         return Factor(job.object, job.epoch, job.step, job.warp, pattern, values, job.worker, seconds, remedy[:200])
+
+    def _from_slot(
+        self, told: SlotMessage, nonzeros: int, job: InFlightJob
+    ) -> tuple[Float32 | Float64, tuple[int, bool]]:  # fmt: skip
+        """Copies the values out of the slot allocated for the job: they must not change any more once they are checked.
+        Returns them, their checksum, and whether all are finite."""
+        slot = job.factor_slot
+        if slot is None:
+            raise Refused("Factor.slot is set, but no slot was lent for this job", "slot")
+        given = (told.segment, told.offset, told.generation)
+        allocated = (slot.segment, slot.offset, job.factor_generation)
+        if given != allocated:
+            raise Refused(f"Factor.slot is {given}; allowed: {allocated}, as lent for this job", "slot")
+        size, room = nonzeros * np.dtype(job.dtype).itemsize, job.room or slot.capacity
+        if size > room:
+            raise Refused(f"Factor.nonzeros is {nonzeros}: {size} bytes in a slot of {room}", "slot")
+        values = (self.memory if size > LARGE else np.empty)(nonzeros, np.dtype(job.dtype))
+        return values, copied(slot.part(job.first, job.dtype, nonzeros), values, own=values)
 
     def _object(self, message: PatternMessage | FactorMessage, key: object, channel: str) -> AnnouncedObject:
         header = check_header(message, incarnation=self._incarnation, object=self.objects)
         if header.object != name_in(channel, key, "object"):
             raise Refused(f"{message.DESCRIPTOR.name}.header.object is {header.object!r}, its key is {key}", "object")
         return self.objects[header.object]
-
-
-def _from_slot(told: SlotMessage, nonzeros: int, job: InFlightJob) -> Float32 | Float64:
-    """Copies the values out of the slot allocated for the job: they must not change any more once they are checked."""
-    slot = job.factor_slot
-    if slot is None:
-        raise Refused("Factor.slot is set, but no slot was lent for this job", "slot")
-    given = (told.segment, told.offset, told.generation)
-    allocated = (slot.segment, slot.offset, job.factor_generation)
-    if given != allocated:
-        raise Refused(f"Factor.slot is {given}; allowed: {allocated}, as lent for this job", "slot")
-    size, room = nonzeros * np.dtype(job.dtype).itemsize, job.room or slot.capacity
-    if size > room:
-        raise Refused(f"Factor.nonzeros is {nonzeros}: {size} bytes in a slot of {room}", "slot")
-    return slot.part(job.first, job.dtype, nonzeros).copy()
 
 
 def _from_payload(message: FactorMessage, payload: Sized) -> Float32 | Float64:

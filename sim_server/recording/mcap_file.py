@@ -8,6 +8,7 @@ import errno
 import os
 import stat
 from pathlib import Path
+from typing import BinaryIO
 
 from google.protobuf.message import Message
 from mcap.well_known import MessageEncoding
@@ -16,6 +17,7 @@ from mcap_protobuf.schema import register_schema
 
 from protocol.channels import PROTOCOL
 from sim_server.errors import InputError
+from sim_server.recording.file_lock import lock
 
 CHUNK_BYTES = 1 << 20
 PROFILE = "warpfactor"
@@ -31,12 +33,7 @@ class McapFile:
     def __init__(self, path: Path, compression: str, overwrite: bool, origin: dict[str, str] | None = None) -> None:
         if compression not in COMPRESSIONS:
             raise InputError(f"recording: compression = {compression!r}: allowed are {', '.join(COMPRESSIONS)}")
-        try:
-            self._stream = path.open("wb" if overwrite else "xb")
-        except FileExistsError:
-            raise InputError(f"{path}: the file exists: remove it or choose another name for the log") from None
-        except OSError as error:
-            raise InputError(f"{path}: a log cannot be written there: {error.strerror}") from None
+        self._stream = _opened(path, overwrite)
         found = os.fstat(self._stream.fileno())
         self.regular = stat.S_ISREG(found.st_mode)
         self._linked = found.st_nlink > 0  # some file systems do not count links
@@ -89,7 +86,39 @@ class McapFile:
         with contextlib.suppress(OSError, ValueError):
             self._stream.close()
 
+    def duplicate(self) -> int:
+        """Returns another descriptor of the file, which keeps it locked after its end."""
+        return os.dup(self._stream.fileno())
+
     def _register(self, topic: str, kind: type[Message]) -> int:
         if kind not in self._schemas:
             self._schemas[kind] = register_schema(self._writer, kind)
         return self._writer.register_channel(topic, MessageEncoding.Protobuf, self._schemas[kind])
+
+
+def _opened(path: Path, overwrite: bool) -> BinaryIO:
+    """Opens a file to be written anew, and locks it before anything in it is lost. Raises InputError."""
+    try:
+        descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | (0 if overwrite else os.O_EXCL), 0o666)
+    except FileExistsError:
+        raise InputError(f"{path}: the file exists: remove it or choose another name for the log") from None
+    except OSError as error:
+        raise InputError(f"{path}: a log cannot be written there: {error.strerror}") from None
+    stream = os.fdopen(descriptor, "wb")
+    try:
+        if stat.S_ISREG(os.fstat(descriptor).st_mode):
+            if not lock(descriptor):
+                raise InputError(is_written(path))
+            os.ftruncate(descriptor, 0)
+    except OSError as error:
+        stream.close()
+        raise InputError(f"{path}: a log cannot be written there: {error.strerror}") from None
+    except InputError:
+        stream.close()
+        raise
+    return stream
+
+
+def is_written(path: Path) -> str:
+    """Says that another process writes a log."""
+    return f"{path}: another server records to this file now; choose another name for the log, or stop that server"

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import secrets
 import shutil
 import time
@@ -13,9 +14,10 @@ from typing import NamedTuple
 
 from google.protobuf.message import Message
 
-from protocol.log_pieces import piece_path
+from protocol.log_pieces import later_pieces, piece_path
 from sim_server.errors import InputError
-from sim_server.recording.mcap_file import McapFile
+from sim_server.recording.file_lock import is_locked
+from sim_server.recording.mcap_file import McapFile, is_written
 from sim_server.recording.rotation import Kept, Rotation, remove_earlier
 
 ROOM = 2 << 20  # bytes free beside what each file begins with, for a new file after the disk was full
@@ -61,9 +63,14 @@ class Pieces:
         self._path, self._compression, self._rotation = path, compression, rotation
         self._run, self._number = secrets.token_hex(8), 1
         self._kept, self.repeated = Kept(rotation), Repeated()
+        for _, piece in later_pieces(path):
+            if is_locked(piece):
+                raise InputError(is_written(piece))
         self._file = McapFile(path, compression, overwrite, self._origin(0))
         self._regular = self._file.regular
+        self._first: int | None = None
         if self._regular:
+            self._first = self._file.duplicate()  # locks the whole log while later files are written
             remove_earlier(path)
         self._begun, self._records = time.monotonic(), 0
         self._ended_bytes = self._file_size = 0  # of all files before, of the last one that was ended
@@ -119,6 +126,12 @@ class Pieces:
         self._file.abandon()
         self._ended_bytes += size
         self._kept.add(self.path, size)
+
+    def close(self) -> None:
+        """Gives the log free for others. A second call does nothing."""
+        first, self._first = self._first, None
+        if first is not None:
+            os.close(first)
 
     def may_go_on(self, first: Sequence[Record]) -> bool:
         """True if a new file that begins with these may be begun after one was abandoned: there is room."""

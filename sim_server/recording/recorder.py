@@ -51,8 +51,8 @@ class Recorder:
     are lost and counted until there is room for a new file, in which the recording goes on; both is reported through
     `report`, and `failure` says what is missing. rotation: when a new file is begun else.
 
-    Raises InputError if the file cannot be created, if it is there already and not to be overwritten, or for an
-    unknown compression.
+    Raises InputError if the file cannot be created, if it is there already and not to be overwritten, if another
+    process records to it, or for an unknown compression.
     """
 
     def __init__(
@@ -242,6 +242,12 @@ class Recorder:
             self._report(f"{self.path}: the disk is too slow, {self._total_bytes >> 20} MiB wait: records are lost")
 
     def _write_all(self) -> None:
+        try:
+            self._write_pieces()
+        finally:
+            self._pieces.close()
+
+    def _write_pieces(self) -> None:
         while True:
             try:
                 self._write_until_closed()

@@ -11,6 +11,7 @@ from pathlib import Path
 
 from protocol.log_pieces import later_pieces, size_of_file
 from sim_server.errors import InputError
+from sim_server.recording.file_lock import is_locked
 from sim_server.scene.sizes import SIZES, TIMES, measure
 
 LEAST_BYTES, LEAST_SECONDS = 10**6, 1.0
@@ -20,7 +21,7 @@ LEAST_BYTES, LEAST_SECONDS = 10**6, 1.0
 class Rotation:
     """bytes, seconds: after which a new file is begun. keep: bytes of all files together. None: no limit
 
-    earlier: files of earlier logs that count to `keep`, oldest first
+    earlier: files of earlier logs that count to `keep`, oldest first, but for those that another server writes
     """
 
     bytes: float | None = None
@@ -62,7 +63,7 @@ class Kept:
 
     def __init__(self, rotation: Rotation):
         self._rotation = rotation
-        ours = (path for path in rotation.earlier if _is_log(path))
+        ours = (path for path in rotation.earlier if _is_log(path) and not is_locked(path))
         self._ended: deque[tuple[Path, int]] = deque((path, size_of_file(path)) for path in ours)
         self.removed = 0
 

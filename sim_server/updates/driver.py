@@ -84,6 +84,7 @@ class Driver:
         if self.wants_factors:
             self.check.prepare()
             self.engine.prepare_for_factors()
+            self.source.use_memory(self.engine.factor_memory)
         self.reactions: Float64 = np.zeros((0, 0, 6))
         self.other_reactions: NDArray[Any] = np.zeros(0, REACTION)
         self.readings: Float64 = np.zeros((0, 0))
@@ -241,8 +242,16 @@ class Driver:
     def _check_beside(self, factors: Sequence[Factor]) -> None:
         held = [self.snapshots.hold(self.by_name[f.object], f.step) for f in factors]
         checked = [(factor, matrix) for factor, (_, matrix) in zip(factors, held, strict=True)]
-        reasons = self._checker.submit(self.check.reject_reasons, checked)
+        applied = self._prepare(factors[0]) if len(factors) == 1 else None
+        reasons = self._checker.submit(self.check.reject_reasons, checked, applied)
         self.checks.append(FactorsUnderCheck(factors, [memory for memory, _ in held], reasons))
+
+    def _prepare(self, factor: Factor) -> Callable[[], Float64 | None] | None:
+        """Has a large factor made ready for use while it is checked, and applied for the check."""
+        if self.check.wrong_size(factor):
+            return None
+        body = self.by_name[factor.object].body.index
+        return self.engine.prepare_factor(body, factor, self.check.vector(factor.object, factor.epoch))
 
     def _begin_checks(self) -> None:
         self._checker, self._process = ThreadPoolExecutor(1, "checks of factors"), os.getpid()
@@ -263,6 +272,7 @@ class Driver:
             good, reasons = [], []
             for factor, reason in zip(check.factors, check.reasons.result(), strict=True):
                 if self.source.epoch(factor.object) not in (None, factor.epoch):
+                    self.engine.drop_factor(self.by_name[factor.object].body.index, factor)
                     self.fail(factor.object, "it was of a mesh that was split since")
                     continue
                 good.append(factor)
@@ -279,6 +289,8 @@ class Driver:
                 self.fail(factor.object, f"that of {factor.worker} is not used: {why}", refused=True)
             elif self.by_name[factor.object].on_factor(factor, self.engine.step):  # else it is older than the newest
                 posted.append(factor)
+                continue
+            self.engine.drop_factor(self.by_name[factor.object].body.index, factor)
         bodies = [self.by_name[factor.object].body.index for factor in posted]
         self.engine.post_factors(bodies, posted)
         for factor in posted:

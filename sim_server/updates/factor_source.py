@@ -4,11 +4,12 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
 from protocol.factor import Factor, FactorPattern
 from protocol.method import Method
@@ -19,6 +20,7 @@ if TYPE_CHECKING:
     from precond_worker.factorization.registry import Factorization
 
 EXACT = Method()
+FactorMemory = Callable[[int, np.dtype[Any]], NDArray[Any]]
 
 
 @dataclass(frozen=True)
@@ -75,6 +77,10 @@ class FactorSource(Protocol):
     def patterns(self) -> list[tuple[str, FactorPattern]]:
         """Returns (object, pattern) of the factors that will come, as far as it is new since the last call."""
         return []
+
+    def use_memory(self, memory: FactorMemory) -> None:
+        """Has large factors that arrive put into arrays that `memory` makes, of their number of values and type."""
+        return
 
     def worker_count(self) -> int:
         """Number of workers that may be given jobs, idle or busy."""

@@ -18,7 +18,7 @@ from protocol import messages_pb2 as pb
 from protocol.network.identity import identity_of
 from protocol.process.own_python import own_module
 from tests.attacks.attacks import Attack, Attacker, Victim
-from tests.ports import free_port
+from tests.ports import free_endpoint
 
 SCENE = """
 dt = 0.02
@@ -64,8 +64,8 @@ class Arena:
         self._closing = contextlib.ExitStack()
         self.folder = Path(self._closing.enter_context(tempfile.TemporaryDirectory(prefix="warpfactor-attacks-")))
         self.tls, self.log = tls, self.folder / "run.mcap"
-        self.endpoint = f"{'tls' if tls else 'tcp'}/127.0.0.1:{free_port()}"
-        self._beside = self.endpoint.rpartition(":")[0] + f":{free_port()}"
+        self.endpoint = free_endpoint(protocol="tls" if tls else "tcp")
+        self._beside = free_endpoint(protocol="tls" if tls else "tcp")
         self._certs = self.folder / "certs"
         (self.folder / "scene.toml").write_text(SCENE)
         words = ["--listen", self.endpoint, "--listen", self._beside, "--workers", "1", "--device", "cpu"]

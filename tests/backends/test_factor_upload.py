@@ -45,6 +45,7 @@ class Maker:
         self.bodies = np.zeros(1, [("setting", "i8"), ("factor", "i8")])
         self.storages: list[list[int]] = []
         self.events: list[Event] = []
+        self.limits: list[int | None] = []  # multiprocessors of each build
         self.fail: Exception | None = None
         self.thread = ThreadPoolExecutor(1)
         self.planning: list[Future] | None = None  # plans that are not made yet; None: each is made at once
@@ -66,14 +67,19 @@ class Maker:
         self.storages.append([])
         return self.storages[-1]
 
-    spared = None
+    spared = 8
 
     def build(self, values: np.ndarray, storage: list[int], multiprocessors: int | None = None) -> PartitionedInverse:
         if self.fail:
             raise self.fail
         storage[:] = [int(values[0])]
+        self.limits.append(multiprocessors)
         self.events.append(Event(self.scene))
         return PartitionedInverse(storage, self.events[-1])
+
+    def apply(self, inverse: PartitionedInverse, r: np.ndarray, multiprocessors: int | None = None) -> np.ndarray:
+        """In place of a factor the number that it is."""
+        return r / inverse.storage[0]
 
     def forget_plans(self, patterns: set[int]) -> None:
         self.known = patterns
@@ -118,6 +124,15 @@ def test_a_factor_is_used_when_it_is_made(parts):
     scene.loop.run(1)
     assert upload.step(0) == 5
     assert used(scene) == [0, 5]
+
+
+@pytest.mark.parametrize(("realtime", "seconds", "limit"), [(1, 1e-4, None), (1, 0.9, 8), (0, 1e-4, 8), (1, 0.0, 8)])
+def test_builds_have_the_whole_device_where_steps_in_real_time_leave_it_idle(parts, realtime, seconds, limit):
+    """seconds: of a step; 0: not known yet."""
+    scene, maker, upload = parts
+    scene.loop.loop.realtime, scene.loop.loop.step_seconds, scene.loop.loop.dt = realtime, seconds, 1.0
+    post(upload, 5)
+    assert maker.limits == [limit]
 
 
 def test_what_comes_too_early_waits_and_the_newest_wins(parts):
@@ -216,6 +231,102 @@ def test_large_factors_are_built_beside_the_caller(parts, monkeypatch):
     upload.settle()
     scene.loop.run(1)
     assert used(scene) == [6] and threading.current_thread() not in callers
+
+
+R = np.ones(3)
+
+
+def prepared(upload: FactorUpload, value: int) -> tuple[np.ndarray, Future]:
+    values = np.array([value])
+    return values, upload.prepare(0, PATTERN, values, value, R)
+
+
+def test_a_prepared_factor_is_built_and_applied_and_used_once_it_is_posted(parts):
+    scene, maker, upload = parts
+    values, applied = prepared(upload, 5)
+    np.testing.assert_array_equal(applied.result(30), R / 5)
+    maker.thread.submit(lambda: None).result()
+    maker.events[0].synchronize()
+    upload.advance()
+    scene.loop.run(2)
+    assert upload.step(0) == -1, "nobody has posted it"
+    upload.post(0, PATTERN, values, 5)
+    scene.loop.run(1)
+    assert upload.step(0) == 5 and len(maker.storages) == 1 and used(scene) == [0, 0, 5]
+
+
+def test_what_is_posted_before_it_is_built_is_used_then(parts):
+    scene, maker, upload = parts
+    go, build = threading.Event(), maker.build
+
+    def slow(*arguments: Any) -> PartitionedInverse:
+        assert go.wait(30)
+        return build(*arguments)
+
+    maker.build = slow
+    values, _ = prepared(upload, 5)
+    upload.post(0, PATTERN, values, 5)
+    go.set()
+    upload.settle()
+    scene.loop.run(1)
+    assert used(scene) == [5] and len(maker.events) == 1
+
+
+@pytest.mark.parametrize("late", [False, True])
+def test_a_dropped_factor_is_never_used_and_leaves_its_storage(parts, late):
+    scene, maker, upload = parts
+    post(upload, 4)
+    upload.settle()
+    scene.loop.run(1)
+    for value in (5, 6, 7):
+        values, applied = prepared(upload, value)
+        if late:
+            applied.result(30)
+            maker.thread.submit(lambda: None).result()
+            upload.advance()
+        upload.drop(0, np.array([value]))  # equal, but not the same: another factor
+        upload.drop(0, values)
+        assert applied.done() or not late
+        maker.thread.submit(lambda: None).result()
+        upload.advance()
+        scene.loop.run(1)
+    post(upload, 8)
+    upload.settle()
+    scene.loop.run(1)
+    assert used(scene) == [4, 4, 4, 4, 8] and len(maker.storages) == 2
+
+
+def test_a_newer_factor_takes_the_place_of_a_prepared_one_and_its_check_is_told(parts):
+    scene, maker, upload = parts
+    _, applied = prepared(upload, 5)
+    applied.result(30)
+    maker.thread.submit(lambda: None).result()
+    upload.advance()
+    post(upload, 6)
+    upload.settle()
+    scene.loop.run(1)
+    assert used(scene) == [6]
+    post(upload, 7)
+    post(upload, 8)  # waits for the loop
+    _, waiting = prepared(upload, 9)
+    prepared(upload, 10)
+    assert waiting.result(0) is None
+
+
+def test_who_checks_is_told_that_nothing_can_be_built(parts, caplog):
+    scene, maker, upload = parts
+    maker.fail = NoMemory("none")
+    values, applied = prepared(upload, 5)
+    assert applied.result(30) is None
+    maker.thread.submit(lambda: None).result()
+    maker.fail = None
+    with caplog.at_level(logging.WARNING):
+        upload.advance()
+    assert "not enough GPU memory" in caplog.text
+    upload.post(0, PATTERN, values, 5)
+    upload.settle()
+    scene.loop.run(1)
+    assert used(scene) == [5]
 
 
 def test_plans_are_kept_of_the_last_two_patterns_alone(parts):

@@ -17,6 +17,7 @@ from sim_server.backends.gpu.device import PRECISIONS, own_headers
 from sim_server.backends.gpu.device import options as device_options
 from sim_server.backends.gpu.energies import BALANCE_TEXT, ELASTIC_TEXT
 from sim_server.backends.gpu.engine import EPILOGUE
+from sim_server.backends.gpu.inverse.apply_inverse import APPLICATION
 from sim_server.backends.gpu.inverse.expansion_batches import INVERSE
 from sim_server.backends.gpu.measured import TEXT as MEASURED_TEXT
 from sim_server.backends.gpu.momentum import MOMENTUM
@@ -51,7 +52,7 @@ def test_the_compiler_agrees_with_all_that_the_loop_shares(tmp_path):
         ("stage_decision.cu", DECISION), ("momentum.cu", MOMENTUM),
         ("contact_state.cuh", structs.CONTACT), ("contact.cu", CONTACT_TEXT),
         ("measured.cu", MEASURED_TEXT), ("step_records.cu", structs.RECORDS),
-        ("inverse/build_inverse.cu", INVERSE),
+        ("inverse/build_inverse.cu", INVERSE), ("inverse/apply_inverse.cu", APPLICATION),
     ],
     ids=lambda value: value if isinstance(value, str) else "layouts",
 )  # fmt: skip

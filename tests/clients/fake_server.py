@@ -13,7 +13,7 @@ from google.protobuf.message import Message
 from protocol import messages_pb2 as pb
 from protocol.channels import commands, everything, key
 from protocol.network.session import open_session
-from tests.ports import free_port
+from tests.ports import free_endpoint
 from tests.sample_contact import MOVED, obstacle, pose
 from tests.sample_run import DT, header, object_step, scene, state, topology
 
@@ -24,7 +24,7 @@ class FakeServer:
     def __init__(
         self, name: str = "sim", objects: tuple[str, ...] = ("beam", "liver"), obstacles: tuple[str, ...] = ()
     ) -> None:
-        self.endpoint = f"tcp/127.0.0.1:{free_port()}"
+        self.endpoint = free_endpoint()
         self.name, self.objects, self.obstacles = name, objects, obstacles
         self.commands: list[pb.Command] = []
         self.state = "running"

@@ -23,8 +23,9 @@ from clients.replay.timeline import Timeline
 from protocol import messages_pb2 as pb
 from sim_server.recording.recorder import Recorder
 from tests.clients.fake_server import FakeServer
+from tests.ports import free_endpoint
 from tests.sample_run import REST, TETS, header, object_step, positions, record, scene, topology, velocities
-from tests.system.link_helpers import PATIENCE, ROOT, free_endpoint
+from tests.system.link_helpers import PATIENCE, ROOT
 from tests.system.server_process import Process, run, tool, until
 
 STEPS = 30

@@ -16,7 +16,7 @@ from protocol.refused import Refused
 from sim_server.recording.recorder import Recorder
 from sim_server.replay.log import Recording
 from sim_server.replay.run import Replay
-from tests.ports import free_port
+from tests.ports import free_endpoint
 from tests.sample_run import REST, positions, state, topology
 from tests.system.server_process import beam, run
 
@@ -116,7 +116,7 @@ def test_a_run_with_one_is_logged_and_repeated_without_its_file(tmp_path: Path) 
     scene, log = beam(tmp_path, bar=(1, 1, 2), solver='update = "every-2"'), tmp_path / "run.mcap"
     scene.write_text(scene.read_text().replace('name = "beam"', 'name = "beam"\nskin = "fine.obj"'))
     (tmp_path / "fine.obj").write_text("v 0.2 0.2 0.3\nv 0.8 0.2 2.9\nv 0.5 0.9 3.5\nf 1 2 3\n")
-    end = ("--steps", "6", "--listen", f"tcp/127.0.0.1:{free_port()}", "--record", str(log), "--device", "cpu")
+    end = ("--steps", "6", "--listen", free_endpoint(), "--record", str(log), "--device", "cpu")
     done = run("sim_server", str(scene), "--free-run", *end)
     assert done.returncode == 0, done.stderr
     (tmp_path / "fine.obj").unlink()

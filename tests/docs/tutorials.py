@@ -18,7 +18,8 @@ from typing import NamedTuple
 from clients.client import Client
 from clients.errors import ClientError
 from tests.docs.figures import DOCS, ROOT
-from tests.system.link_helpers import PATIENCE, free_endpoint
+from tests.ports import free_endpoint
+from tests.system.link_helpers import PATIENCE
 
 FOLDER = DOCS / "tutorials"
 APART = "# in a terminal of its own"

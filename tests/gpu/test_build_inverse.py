@@ -71,11 +71,54 @@ def test_it_applies_as_the_triangular_solves_do(gpu, groups, planes, bound):
     assert np.linalg.norm(z - expected) <= bound * np.linalg.norm(expected)
 
 
+@pytest.mark.parametrize("planes", [1, 2])
+@pytest.mark.parametrize("groups", [1, 2, 3, 4])
+def test_one_application_beside_the_steps_is_that_of_the_solver(gpu, groups, planes):
+    from sim_server.backends.gpu.inverse.apply_inverse import InverseApplication
+    from sim_server.backends.gpu.inverse.build_inverse import InverseBuilder
+
+    shape, values = factor(MIDDLE, seed=1)
+    p = plan(shape, 132, groups, planes)
+    builder = InverseBuilder(gpu, shape, p)
+    storage = builder.storage()
+    made = builder.build(values, storage)
+    application = InverseApplication(gpu, p)
+    chunks, scale = expanded(gpu, shape, values, p)
+    for seed in range(3):
+        r = np.random.default_rng(seed).normal(size=shape.size)
+        z = application.begin(made.matrix, made.scale, r, builder._workspace.stream, 132 if seed else 1).result()
+        expected = Application(p, chunks, scale)(r)
+        assert np.linalg.norm(z - expected) <= 1e-5 * np.linalg.norm(expected)
+
+
 def test_few_multiprocessors_make_the_same_bits(gpu):
     shape, values = factor(MIDDLE)
     p = plan(shape, 132, 2)
     (all_chunks, all_scale), (chunks, scale) = (expanded(gpu, shape, values, p, limit) for limit in (None, 3))
     assert np.array_equal(all_chunks.view(np.uint16), chunks.view(np.uint16)) and np.array_equal(all_scale, scale)
+
+
+@pytest.mark.parametrize("count", [1, 3])
+def test_values_in_pinned_memory_make_the_same_bits(gpu, count):
+    """They are copied by the device itself; their memory may be given up, and used again, before that."""
+    from sim_server.backends.gpu.inverse.build_inverse import InverseBuilder
+    from sim_server.backends.gpu.pinned import PinnedArray, pinned_array
+
+    shape, values = factor(MIDDLE)
+    p = plan(shape, 132, 2)
+    chunks, scale = expanded(gpu, shape, values, p)
+    builder = InverseBuilder(gpu, shape, p)
+    storage = builder.storage()
+    for _ in range(count):
+        pinned = pinned_array(gpu.cp, len(values), np.dtype(np.float32))
+        pinned[:] = values
+        assert isinstance(pinned, PinnedArray)
+        made = builder.build(pinned, storage)
+        del pinned
+        pinned_array(gpu.cp, len(values), np.dtype(np.float32))[:] = 3  # other memory, as long as the copy lasts
+    made.event.synchronize()
+    assert np.array_equal(storage.matrix.get().view(np.uint16), chunks.view(np.uint16))
+    assert np.array_equal(storage.scale.get(), scale)
 
 
 def test_the_scale_ends_with_its_largest(gpu):

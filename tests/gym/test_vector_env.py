@@ -1,14 +1,15 @@
 # SPDX-License-Identifier: MIT
 """Copies of a scene as an environment of gymnasium: they move as one body alone does, and begin again one by one."""
 
-import gymnasium
 import numpy as np
 import pytest
-from gymnasium.utils.env_checker import data_equivalence
-from gymnasium.vector import AutoresetMode
 
 import warpfactor as wf
 from sim_server.errors import InputError
+
+gymnasium = pytest.importorskip("gymnasium", reason="needs the extra gym")
+data_equivalence = pytest.importorskip("gymnasium.utils.env_checker").data_equivalence
+AutoresetMode = gymnasium.vector.AutoresetMode
 
 N = 3
 FINGER = {

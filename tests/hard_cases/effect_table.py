@@ -154,27 +154,61 @@ def _uneven(table: Table, random: Random) -> Table:
     }
 
 
+def _heavy_on_soft(random: Random, density: float) -> Table:
+    return touching(
+        cube("soft", (-0.05, 0.002, -0.05), size=(0.2, 0.1, 0.2), density=100, young=1e6, own=LOOSE),
+        _uneven(cube("heavy", (0, 0.112, 0), density=density, young=1e8, own=LOOSE), random),
+    )
+
+
+def _between(random: Random, *obstacles: Table) -> Table:
+    return touching(_uneven(cube(at=(0, 0.15, 0), own=LOOSE), random), obstacle=list(obstacles))
+
+
+def _plastic(random: Random, *obstacles: Table) -> Table:
+    plasticity = {"yield_stress": 1e3 * random.uniform(1, 5), "hardening": 1e4}
+    return touching(cube(own=LOOSE | {"plasticity": plasticity}), obstacle=list(obstacles))
+
+
+def _hand(*keyframes: tuple[float, float]) -> Table:
+    """Holds the end and moves it along x. keyframes: time [s], way [m]."""
+    moves = [{"time": time, "translate": [way, 0, 0]} for time, way in keyframes]
+    return {"name": "hand", "object": "cube", "where": END, "keyframes": moves}
+
+
+def _torn(random: Random, way: float) -> Table:
+    damage = {"strength": 1e3 * random.uniform(1, 3), "fracture_energy": 20.0}
+    return alone(
+        cube(cells=(6, 2, 2), own=HELD | LOOSE | {"damage": damage}), holder=[_hand((0, 0), (1, way))],
+        integrator={"scheme": "backward_euler", "linearizations": 6},
+    )  # fmt: skip
+
+
+def _jumped(random: Random, way: float) -> Table:
+    hand = _hand((0.2, 0), (0.21, way), (0.4, way), (0.41, 0))
+    return alone(cube(own=HELD | LOOSE, density=random.uniform(500, 2000)), holder=[hand])
+
+
 CONTACT = [
     EffectCase(
         "heavy on soft",
         "a cube of 1000 times the density falls 1 cm onto one of 1 MPa, and lies on it",
         "its middle below that of the soft one, in m, within",
-        lambda r: touching(
-            cube("soft", (-0.05, 0.002, -0.05), size=(0.2, 0.1, 0.2), density=100, young=1e6, own=LOOSE),
-            _uneven(cube("heavy", (0, 0.112, 0), density=1e5, young=1e8, own=LOOSE), r),
-        ),
+        lambda r: _heavy_on_soft(r, 1e5),
         of_order,
         -0.05,
         200,
+        easy=lambda r: _heavy_on_soft(r, 100),
     ),
     EffectCase(
         "wedge",
         "a cube falls between two planes of 60 degrees",
         SPEED,
-        lambda r: touching(_uneven(cube(at=(0, 0.15, 0), own=LOOSE), r), obstacle=SLOPES),
+        lambda r: _between(r, *SLOPES),
         speed,
         1e-3,
         300,
+        easy=lambda r: _between(r, FLOOR),
     ),
     EffectCase(
         "fast and small on thin",
@@ -273,14 +307,12 @@ MEMORY = [
         "plasticity, crushed flat",
         "pressed to less than a third by a ram and let go",
         "below the floor within, in m",
-        lambda r: touching(
-            cube(own=LOOSE | {"plasticity": {"yield_stress": 1e3 * r.uniform(1, 5), "hardening": 1e4}}),
-            obstacle=[FLOOR, RAM],
-        ),
+        lambda r: _plastic(r, FLOOR, RAM),
         below_floor,
         1e-3,
         120,
         unconverged={"contact": 60},
+        easy=lambda r: _plastic(r, FLOOR),
     ),
     EffectCase(
         "prony, a jump of the load",
@@ -305,25 +337,12 @@ MEMORY = [
         "damage, torn through",
         "pulled at its end until it is torn, and on",
         GIVEN,
-        lambda r: alone(
-            cube(
-                cells=(6, 2, 2),
-                own=HELD | LOOSE | {"damage": {"strength": 1e3 * r.uniform(1, 3), "fracture_energy": 20.0}},
-            ),
-            holder=[
-                {
-                    "name": "hand",
-                    "object": "cube",
-                    "where": END,
-                    "keyframes": [{"time": 0}, {"time": 1, "translate": [0.2, 0, 0]}],
-                }
-            ],
-            integrator={"scheme": "backward_euler", "linearizations": 6},
-        ),
+        lambda r: _torn(r, 0.2),
         energy_rise,
         2.0,
         120,
         unconverged={"max_linearizations": 120},
+        easy=lambda r: _torn(r, 0.002),
     ),
 ]
 
@@ -396,25 +415,11 @@ LOADS = [
         "a holder that jumps",
         "two lengths in a step, and back",
         REST,
-        lambda r: alone(
-            cube(own=HELD | LOOSE, density=r.uniform(500, 2000)),
-            holder=[
-                {
-                    "name": "hand",
-                    "object": "cube",
-                    "where": END,
-                    "keyframes": [
-                        {"time": 0.2},
-                        {"time": 0.21, "translate": [0.2, 0, 0]},
-                        {"time": 0.4, "translate": [0.2, 0, 0]},
-                        {"time": 0.41},
-                    ],
-                }
-            ],
-        ),
+        lambda r: _jumped(r, 0.2),
         back_to_rest,
         1e-3,
         400,
+        easy=lambda r: _jumped(r, 0.002),
     ),
     EffectCase(
         "a stiffness that jumps by 1e6",

@@ -14,7 +14,7 @@ from protocol.log_chunks import BadLog, ChunkFile
 from sim_server.recording.mcap_file import McapFile
 from sim_server.replay.log import Recording
 from sim_server.replay.run import Replay
-from tests.system.link_helpers import free_endpoint
+from tests.ports import free_endpoint
 from tests.system.server_process import beam, run
 
 STEPS, MUTATIONS = 20, 80

@@ -16,7 +16,7 @@ from sim_server.replay.run import Replay
 from sim_server.scene import earlier_defaults
 from sim_server.scene.model import Scene
 from sim_server.simulation import Simulation
-from tests.system.link_helpers import free_endpoint
+from tests.ports import free_endpoint
 from tests.system.server_process import run
 
 CELLS, SIZE = [3, 2, 2], [1.5, 1.0, 1.0]

@@ -11,7 +11,7 @@ import pytest
 from protocol.network.endpoints import port_of
 from protocol.network.identity import identity_of
 from protocol.network.session import open_session
-from tests.ports import free_port
+from tests.ports import free_endpoint
 from tests.system.server_process import run
 
 pytestmark = pytest.mark.system
@@ -19,7 +19,7 @@ IDLE = 400  # zenoh lets 100 wait by default, and refused all others until these
 
 
 def test_they_keep_nobody_out() -> None:
-    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    endpoint = free_endpoint()
     with open_session("server", listen=[endpoint], shared_memory=False), ExitStack() as closing:
         for _ in range(IDLE):
             where = ("127.0.0.1", port_of(endpoint))
@@ -31,7 +31,7 @@ def test_they_keep_nobody_out() -> None:
 def test_handshakes_that_fail_at_one_endpoint_keep_nobody_out_at_another(tmp_path: Path) -> None:
     """At their own they do: zenoh takes no other connection for 0.1 s after each."""
     assert run("sim_server", "certs", str(tmp_path), "--host", "localhost").returncode == 0
-    public, own = (f"tls/127.0.0.1:{free_port()}" for _ in "ab")
+    public, own = (free_endpoint(protocol="tls") for _ in "ab")
     server, client = (identity_of(tmp_path / name, ()) for name in ("server", "operator"))
     with open_session("server", listen=[public, own], shared_memory=False, tls=server), ExitStack() as closing:
         for _ in range(IDLE):

@@ -17,7 +17,7 @@ from protocol import messages_pb2 as pb
 from protocol.channels import PROTOCOL, key
 from protocol.network.identity import identity_of
 from protocol.network.session import open_session
-from tests.ports import free_port
+from tests.ports import free_endpoint
 from tests.system.server_process import PATIENCE, Stage, beam, run, until
 
 pytestmark = pytest.mark.system
@@ -39,7 +39,7 @@ class RouterStage(Stage):
 
     def __init__(self, folder: Path):
         super().__init__(folder)
-        self.router, self.certs = f"tls/127.0.0.1:{free_port()}", folder / "certs"
+        self.router, self.certs = free_endpoint(protocol="tls"), folder / "certs"
         for words in (["--host", "localhost", "--client", "bob:operator"],
                       ["--client", "meeting:router", "--host", "localhost"]):  # fmt: skip
             done = run("sim_server", "certs", str(self.certs), *words)

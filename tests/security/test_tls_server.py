@@ -29,7 +29,8 @@ from sim_server.errors import InputError
 from sim_server.network import job_sender
 from sim_server.network.factor_fetch import FactorFetch
 from sim_server.network.link import ServerLink
-from tests.system.link_helpers import DenseAnalysis, Driver, chain, dense, free_endpoint, matrix, product
+from tests.ports import free_endpoint
+from tests.system.link_helpers import DenseAnalysis, Driver, chain, dense, matrix, product
 from tests.system.server_process import PATIENCE, Stage, beam, run, until
 
 pytestmark = pytest.mark.system

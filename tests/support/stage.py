@@ -16,7 +16,7 @@ import numpy as np
 
 from clients.client import Client
 from clients.errors import ClientError
-from tests.ports import free_port
+from tests.ports import free_endpoint
 
 DT = 0.02  # s
 SCENE = f"""
@@ -35,11 +35,6 @@ fixed = {{ where = "Z < 0.01" }}
 touch = true
 """
 PATIENCE = 60.0  # s
-
-
-def free_endpoint(host: str = "127.0.0.1") -> str:
-    """A port that nobody listens on."""
-    return f"tcp/{host}:{free_port()}"
 
 
 class Stage:

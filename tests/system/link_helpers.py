@@ -19,15 +19,9 @@ from protocol.messages_pb2 import Header, Topology
 from protocol.method import Method
 from sim_server.network.link import ServerLink
 from sim_server.updates.factor_source import Job
-from tests.ports import free_port
 
 ROOT = Path(__file__).parents[2]
 PATIENCE = 60.0  # s until a test gives up: half of what pytest gives it
-
-
-def free_endpoint() -> str:
-    """A loopback endpoint that nobody listens on."""
-    return f"tcp/127.0.0.1:{free_port()}"
 
 
 def chain(nodes: int = 8, object: str = "beam", epoch: int = 1) -> Topology:

@@ -13,7 +13,8 @@ from pathlib import Path
 from clients.client import Client
 from clients.errors import ClientError
 from protocol import messages_pb2 as pb
-from tests.system.link_helpers import PATIENCE, ROOT, free_endpoint
+from tests.ports import free_endpoint
+from tests.system.link_helpers import PATIENCE, ROOT
 
 BEAM = """
 dt = 0.02

@@ -5,9 +5,10 @@ from contextlib import ExitStack
 
 import pytest
 from hand_worker import HandWorker
-from link_helpers import Driver, chain, free_endpoint
+from link_helpers import Driver, chain
 
 from sim_server.network.link import ServerLink
+from tests.ports import free_endpoint
 
 pytestmark = pytest.mark.system
 

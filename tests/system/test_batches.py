@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from hand_worker import HandWorker
-from link_helpers import DenseAnalysis, Driver, chain, dense, free_endpoint, light_worker, matrix, product
+from link_helpers import DenseAnalysis, Driver, chain, dense, light_worker, matrix, product
 from zenoh.handlers import RingChannel
 
 from protocol.channels import key
@@ -21,6 +21,7 @@ from protocol.validate import checksum
 from sim_server.network import factor_intake, job_sender, worker_choice
 from sim_server.network.link import ServerLink
 from sim_server.updates.factor_source import Job
+from tests.ports import free_endpoint
 
 pytestmark = [
     pytest.mark.system,
@@ -198,41 +199,36 @@ def field(name: str, value: Any) -> Spoil:
     return spoil
 
 
-# What is wrong with the second of four answers, and how it is refused. Those of the others count.
-ONE: dict[str, tuple[str, Spoil]] = {
+# What is wrong with the second of four answers, in the message or the first value of its factor, and how it is refused.
+ONE: dict[str, tuple[str, Spoil | float]] = {
     "checksum": ("checksum", field("checksums", 7)),
     "pattern never sent": ("pattern", field("patterns", 7)),
     "size": ("shape", field("nonzeros", 2**62)),
     "NaN seconds": ("malformed", field("seconds", math.nan)),
     "negative seconds": ("malformed", field("seconds", -1.0)),
+    "NaN": ("not_finite", math.nan),
+    "negative diagonal": ("not_positive", -1.0),
 }
 
 
 @pytest.mark.parametrize("name", ONE)
 def test_what_is_wrong_with_one_costs_the_others_nothing(stage: Hand, name: str) -> None:
-    kind, spoil = ONE[name]
+    kind, wrong = ONE[name]
+
+    def edit(place: int, values: np.ndarray) -> np.ndarray:
+        if place == 1 and isinstance(wrong, float):
+            values[0] = wrong
+        return values
+
     batch, before = stage.batch(), stage.driver.link.counters.refusals[kind]
-    message = stage.answer(batch)
-    spoil(message)
+    message = stage.answer(batch, edit=edit)
+    if callable(wrong):
+        wrong(message)
     stage.send(message)
     stage.driver.until(lambda: all_are_back(stage), "the answers")
     stage.check_factors()
     assert stage.made() == {"a", "c", "d"} and stage.failed() == {"b"}
     assert stage.driver.link.counters.refusals[kind] == before + 1 and stage.driver.link.slots_lent == 0
-
-
-@pytest.mark.parametrize(("value", "kind"), [(math.nan, "not_finite"), (-1.0, "not_positive")])
-def test_bad_values_of_one_cost_the_others_nothing(stage: Hand, value: float, kind: str) -> None:
-    def edit(place: int, values: np.ndarray) -> np.ndarray:
-        if place == 2:
-            values[0] = value
-        return values
-
-    batch, before = stage.batch(), stage.driver.link.counters.refusals[kind]
-    stage.send(stage.answer(batch, edit=edit))
-    stage.driver.until(lambda: all_are_back(stage), "the answers")
-    assert stage.made() == {"a", "b", "d"} and stage.failed() == {"c"}
-    assert stage.driver.link.counters.refusals[kind] == before + 1
 
 
 def test_a_failed_job_is_told_with_its_reason(stage: Hand) -> None:

@@ -19,7 +19,7 @@ import pytest
 from websockets.sync.server import ServerConnection, serve
 
 from protocol.channels import SERVER_NAME
-from tests.ports import free_port
+from tests.ports import free_endpoint, free_port
 from tests.system.server_process import PATIENCE, Stage, until
 from tests.system.test_replay_of_a_server import CPU
 
@@ -246,7 +246,7 @@ def shown(slicer: Any) -> np.ndarray:
 
 def test_an_example_without_a_server_says_so(tmp_path: Path) -> None:
     command = [sys.executable, str(ROOT / "clients" / "examples" / "ros2.py"), "--server", SERVER_NAME]
-    where = {**os.environ, "WARPFACTOR_CONNECT": f"tcp/127.0.0.1:{free_port()}", "PYTHONPATH": str(ROOT)}
+    where = {**os.environ, "WARPFACTOR_CONNECT": free_endpoint(), "PYTHONPATH": str(ROOT)}
     begun = time.monotonic()
     done = subprocess.run(command, env=where, capture_output=True, text=True, timeout=PATIENCE)
     assert done.returncode == 1 and done.stderr.startswith("ros2: no server ")

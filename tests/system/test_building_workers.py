@@ -3,14 +3,14 @@
 
 import numpy as np
 import pytest
-from link_helpers import Driver, free_endpoint, process
+from link_helpers import Driver, process
 
-from sim_server.network.link import ServerLink
-from sim_server.recording import messages
 from sim_server.simulation import Simulation
 from sim_server.updates.driver import Driver as Loop
 from sim_server.updates.factor_source import Job
+from tests.ports import free_endpoint
 from tests.scenes import bar, simulation
+from tests.support.link import link_of
 
 pytestmark = pytest.mark.system
 
@@ -26,10 +26,8 @@ def test_the_same_factor_as_of_the_matrix_sent() -> None:
     sim, endpoint = served("async"), free_endpoint()
     sim.engine.run(5)
     sim.engine.assemble()
-    with ServerLink(listen=[endpoint]) as link, process("-m", "precond_worker", "--connect", endpoint):
+    with link_of(sim, endpoint) as link, process("-m", "precond_worker", "--connect", endpoint):
         driver = Driver(link)
-        link.set_scene(messages.scene(sim))
-        link.announce(messages.topology(sim, sim.world.bodies[0]))
         driver.until(link.dispatch.assembles_matrices, "a worker that builds")
         factors = []
         for step, values in ((1, sim.system.values), (2, sim.world.x), (3, sim.system.values), (4, sim.world.x)):
@@ -47,9 +45,7 @@ def test_a_run_with_positions_alone_repeats_the_run_with_matrices() -> None:
     for build in ("worker", "server"):
         sim, endpoint = served("lockstep-2"), free_endpoint()
         object.__setattr__(sim.scene.solver, "build", build)
-        with ServerLink(listen=[endpoint]) as link, process("-m", "precond_worker", "--connect", endpoint):
-            link.set_scene(messages.scene(sim))
-            link.announce(messages.topology(sim, sim.world.bodies[0]))
+        with link_of(sim, endpoint) as link, process("-m", "precond_worker", "--connect", endpoint):
             Driver(link).until(link.dispatch.workers, "a worker")
             records = Loop(sim, link.dispatch).advance(15)
             sent.append(link.counters.bytes_out / link.counters.jobs)
@@ -61,9 +57,7 @@ def test_a_run_with_positions_alone_repeats_the_run_with_matrices() -> None:
 def test_while_something_is_grabbed_the_matrix_is_sent() -> None:
     sim, endpoint = served("lockstep-2"), free_endpoint()
     touch = sim.effects["touch"]
-    with ServerLink(listen=[endpoint]) as link, process("-m", "precond_worker", "--connect", endpoint):
-        link.set_scene(messages.scene(sim))
-        link.announce(messages.topology(sim, sim.world.bodies[0]))
+    with link_of(sim, endpoint) as link, process("-m", "precond_worker", "--connect", endpoint):
         Driver(link).until(link.dispatch.workers, "a worker")
         loop = Loop(sim, link.dispatch)
         held = touch.grab("me", "bar", (4, 1, 1), 0.0, (2, 3, 0), 1e4, 0.0, 1e9)  # type: ignore[attr-defined]

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 import zenoh
-from link_helpers import Driver, chain, free_endpoint
+from link_helpers import Driver, chain
 from zenoh.handlers import RingChannel
 
 from protocol.channels import FORMER_COMMAND, PROTOCOL, key
@@ -29,6 +29,7 @@ from protocol.network.session import open_session
 from sim_server.network.command_queue import CAPACITY
 from sim_server.network.link import ServerLink
 from sim_server.network.queryables import OUTDATED
+from tests.ports import free_endpoint
 
 pytestmark = pytest.mark.system
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from hand_worker import HandWorker
-from link_helpers import Driver, chain, free_endpoint, matrix, process
+from link_helpers import Driver, chain, matrix, process
 
 from protocol.channels import key
 from protocol.messages_pb2 import Factor, Status
@@ -17,6 +17,7 @@ from protocol.network.session import open_session
 from protocol.shared_memory import limits as shm_limits
 from sim_server.network.link import ServerLink
 from sim_server.updates.factor_source import Job
+from tests.ports import free_endpoint
 
 pytestmark = pytest.mark.system
 

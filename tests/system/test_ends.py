@@ -10,8 +10,9 @@ import pytest
 
 from clients.log.reader import Log
 from sim_server.recording.starts import earlier, started
+from tests.ports import free_endpoint
 from tests.sample_run import record
-from tests.system.link_helpers import PATIENCE, ROOT, free_endpoint
+from tests.system.link_helpers import PATIENCE, ROOT
 from tests.system.server_process import Stage, beam, fresh, run, until
 
 pytestmark = pytest.mark.system

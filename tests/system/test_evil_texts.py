@@ -5,11 +5,12 @@ import logging
 
 import pytest
 from hand_worker import HandWorker
-from link_helpers import Driver, chain, free_endpoint
+from link_helpers import Driver, chain
 from server_process import run
 
 from protocol.messages_pb2 import Status
 from sim_server.network.link import ServerLink
+from tests.ports import free_endpoint
 
 pytestmark = pytest.mark.system
 

@@ -3,15 +3,17 @@
 
 import os
 import signal
+import subprocess
 import threading
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
 import zenoh
 from hand_worker import HandWorker
-from link_helpers import Driver, chain, dense, free_endpoint, light_worker, matrix, product
+from link_helpers import Driver, chain, dense, light_worker, matrix, product
 
 from protocol.channels import PROTOCOL, key
 from protocol.messages_pb2 import Factor, FactorPart, Header, Matrix
@@ -21,6 +23,7 @@ from protocol.shared_memory import limits as shm_limits
 from sim_server.network import factor_fetch, job_sender
 from sim_server.network.factor_fetch import FactorFetch
 from sim_server.network.link import ServerLink
+from tests.ports import free_endpoint
 
 pytestmark = pytest.mark.system
 shared = pytest.mark.skipif(bool(shm_limits.obstacle()), reason=f"no shared memory here: {shm_limits.obstacle()}")
@@ -52,6 +55,30 @@ class Gate:
             return took(fetch, number, *rest)
 
         monkeypatch.setattr(FactorFetch, "took", held)
+
+
+class UnderWay(NamedTuple):
+    """A factor of the beam on its way from a worker; no part comes until the gate is opened."""
+
+    gate: Gate
+    endpoint: str
+    link: ServerLink
+    driver: Driver
+    worker: subprocess.Popen[str]
+
+
+@contextmanager
+def under_way(
+    monkeypatch: pytest.MonkeyPatch, parts: int, *way: str, silence: float = 2.0
+) -> Iterator[UnderWay]:  # fmt: skip
+    """The first `parts` parts have come."""
+    gate, endpoint = Gate(monkeypatch, "beam", parts), free_endpoint()
+    with ServerLink(listen=[endpoint], silence=silence) as link, light_worker(endpoint, "light", *way) as worker:
+        driver = Driver(link)
+        link.announce(BEAM)
+        driver.submit(BEAM, 1)
+        driver.until(gate.reached.is_set, f"{parts} parts")
+        yield UnderWay(gate, endpoint, link, driver, worker)
 
 
 def is_right(factor: Any, shift: float = 0.0) -> bool:
@@ -87,18 +114,11 @@ def test_what_is_not_large_travels_as_before(monkeypatch: pytest.MonkeyPatch) ->
 
 @ways
 def test_the_worker_is_killed_in_the_middle(monkeypatch: pytest.MonkeyPatch, way: str) -> None:
-    gate = Gate(monkeypatch, "beam", after=3)
-    endpoint = free_endpoint()
-    with ServerLink(listen=[endpoint]) as link:
-        driver = Driver(link)
-        link.announce(BEAM)
-        with light_worker(endpoint, "first", way) as first:
-            driver.submit(BEAM, 1)
-            driver.until(gate.reached.is_set, "three parts")
-            os.kill(first.pid, signal.SIGKILL)
-            driver.until(lambda: driver.failures, "the loss")
-            assert driver.failures[0] == ("beam", "factorization of beam at step 1 was lost with worker first")
-            gate.open.set()
+    with under_way(monkeypatch, 3, way) as (gate, endpoint, link, driver, worker):
+        os.kill(worker.pid, signal.SIGKILL)
+        driver.until(lambda: driver.failures, "the loss")
+        assert driver.failures[0] == ("beam", "factorization of beam at step 1 was lost with worker light")
+        gate.open.set()
         driver.until(lambda: not link.dispatch.decoding, "the end of the fetch")
         assert driver.factors == [] and link.slots_lent == 0
         with light_worker(endpoint, "second", way):
@@ -109,13 +129,7 @@ def test_the_worker_is_killed_in_the_middle(monkeypatch: pytest.MonkeyPatch, way
 def test_a_worker_that_stops_is_given_up_and_answers_again_later(monkeypatch: pytest.MonkeyPatch, way: str) -> None:
     """Slots that it may still write to are not lent again."""
     monkeypatch.setattr(factor_fetch, "QUESTION_TIME", 0.3)
-    gate = Gate(monkeypatch, "beam", after=3)
-    endpoint = free_endpoint()
-    with ServerLink(listen=[endpoint], silence=60) as link, light_worker(endpoint, "light", way) as worker:
-        driver = Driver(link)
-        link.announce(BEAM)
-        driver.submit(BEAM, 1)
-        driver.until(gate.reached.is_set, "three parts")
+    with under_way(monkeypatch, 3, way, silence=60) as (gate, _, link, driver, worker):
         os.kill(worker.pid, signal.SIGSTOP)
         gate.open.set()
         driver.until(lambda: driver.failures, "the end of patience")
@@ -128,14 +142,8 @@ def test_a_worker_that_stops_is_given_up_and_answers_again_later(monkeypatch: py
 
 def test_a_large_factor_holds_up_no_other_object(monkeypatch: pytest.MonkeyPatch) -> None:
     """While the parts of one are under way its worker has the job of another, whose factor overtakes it."""
-    gate = Gate(monkeypatch, "beam", after=2)
-    endpoint = free_endpoint()
-    with ServerLink(listen=[endpoint]) as link, light_worker(endpoint):
-        driver = Driver(link)
-        link.announce(BEAM)
+    with under_way(monkeypatch, 2) as (gate, _, link, driver, _):
         link.announce(BLOCK)
-        driver.submit(BEAM, 1)
-        driver.until(gate.reached.is_set, "two parts")
         assert driver.factor(BLOCK, 7).object == "block"
         assert [factor.object for factor in driver.factors] == ["block"]
         gate.open.set()
@@ -143,37 +151,9 @@ def test_a_large_factor_holds_up_no_other_object(monkeypatch: pytest.MonkeyPatch
         assert is_right(driver.factors[1]) and driver.failures == []
 
 
-def test_who_announces_and_sends_nothing_is_passed_over(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Another worker has the job once no part has come for a while, and the questions that wait end at once."""
-    monkeypatch.setattr(factor_fetch, "STALL", 0.2)
-    monkeypatch.setattr(factor_fetch, "QUESTION_TIME", 1000.0)
-    endpoint = free_endpoint()
-    with ServerLink(listen=[endpoint], silence=60) as link, PartsByHand(endpoint, link.incarnation) as hand:
-        driver, held = Driver(link), list[Any]()  # questions that are never answered
-        link.announce(BEAM)
-        hand.hello()
-        driver.submit(BEAM, 1)
-        answer, _ = hand.announcement(hand.receive())
-        hand.session.zenoh.declare_queryable(key("part", worker="hand"), held.append)
-        hand.answer(answer)
-        driver.until(lambda: held, "a question")
-        with light_worker(endpoint):
-            driver.until(lambda: len(link.dispatch.workers()) == 2, "the other worker")
-            driver.until(lambda: link.dispatch.reassigned() == ["beam"], "the job to be free")
-            driver.until(lambda: not link.dispatch.decoding, "the end of the fetch")
-            assert link.dispatch.reliability.failing_objects == {"beam"}, "it is held against who sent nothing"
-            hand.close()
-            assert is_right(driver.factor(BEAM, 2)) and driver.factors[0].worker == "light"
-
-
 def test_a_split_drops_what_is_under_way(monkeypatch: pytest.MonkeyPatch) -> None:
-    gate = Gate(monkeypatch, "beam", after=2)
-    endpoint, split = free_endpoint(), chain(nodes=9, epoch=2)
-    with ServerLink(listen=[endpoint]) as link, light_worker(endpoint):
-        driver = Driver(link)
-        link.announce(BEAM)
-        driver.submit(BEAM, 1)
-        driver.until(gate.reached.is_set, "two parts")
+    split = chain(nodes=9, epoch=2)
+    with under_way(monkeypatch, 2) as (gate, _, link, driver, _):
         link.announce(split)
         gate.open.set()
         factor = driver.factor(split, 2)
@@ -250,6 +230,17 @@ class PartsByHand(HandWorker):
         return answer, values
 
 
+@contextmanager
+def announced(endpoint: str) -> Iterator[tuple[PartsByHand, Driver, Factor, np.ndarray]]:
+    """A worker by hand that has a job; its announcement of the factor, which is not sent yet, and the values."""
+    with ServerLink(listen=[endpoint], silence=60) as link, PartsByHand(endpoint, link.incarnation) as hand:
+        driver = Driver(link)
+        link.announce(BEAM)
+        hand.hello()
+        driver.submit(BEAM, 1)
+        yield hand, driver, *hand.announcement(hand.receive())
+
+
 def message(question: FactorPart, **changes: int) -> bytes:
     header = Header(protocol=PROTOCOL, incarnation=question.header.incarnation + changes.pop("life", 0))
     fields = {"job": question.job, "number": question.number, **changes}
@@ -272,14 +263,8 @@ def test_what_never_completes_is_dropped_with_the_reason(
     monkeypatch: pytest.MonkeyPatch, what: str, told: str
 ) -> None:  # fmt: skip
     monkeypatch.setattr(factor_fetch, "PAUSE", 0.0)
-    endpoint = free_endpoint()
-    with ServerLink(listen=[endpoint], silence=60) as link, PartsByHand(endpoint, link.incarnation) as hand:
-        driver = Driver(link)
-        link.announce(BEAM)
-        hand.hello()
-        driver.submit(BEAM, 1)
-        answer, values = hand.announcement(hand.receive())
-        data = bytes_of(values)
+    with announced(free_endpoint()) as (hand, driver, answer, values):
+        data, link = bytes_of(values), driver.link
         if what == "NaN":
             values[5] = np.nan
             answer.parts[:] = part_checksums(data, PART)
@@ -308,13 +293,7 @@ def test_what_never_completes_is_dropped_with_the_reason(
 
 def test_a_second_announcement_is_refused_while_the_first_is_fetched(monkeypatch: pytest.MonkeyPatch) -> None:
     gate = Gate(monkeypatch, "beam", after=1)
-    endpoint = free_endpoint()
-    with ServerLink(listen=[endpoint], silence=60) as link, PartsByHand(endpoint, link.incarnation) as hand:
-        driver = Driver(link)
-        link.announce(BEAM)
-        hand.hello()
-        driver.submit(BEAM, 1)
-        answer, values = hand.announcement(hand.receive())
+    with announced(free_endpoint()) as (hand, driver, answer, values):
         data = bytes_of(values)
         hand.serve(lambda question: (part(data, question.number, PART).tobytes(), message(question)))
         hand.answer(answer)
@@ -322,7 +301,27 @@ def test_a_second_announcement_is_refused_while_the_first_is_fetched(monkeypatch
         forged = Factor.FromString(answer.SerializeToString())
         forged.parts[:] = [1] * len(forged.parts)
         hand.answer(forged)
-        driver.until(lambda: link.counters.refusals["duplicate"] == 1, "the refusal of the second")
+        driver.until(lambda: driver.link.counters.refusals["duplicate"] == 1, "the refusal of the second")
         gate.open.set()
         driver.until(lambda: driver.factors, "the factor")
         assert is_right(driver.factors[0]) and driver.failures == []
+
+
+def test_who_announces_and_sends_nothing_is_passed_over(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Another worker has the job once no part has come for a while, and the questions that wait end at once."""
+    monkeypatch.setattr(factor_fetch, "STALL", 0.2)
+    monkeypatch.setattr(factor_fetch, "QUESTION_TIME", 1000.0)
+    held: list[Any] = []  # questions that are never answered
+    endpoint = free_endpoint()
+    with announced(endpoint) as (hand, driver, answer, _):
+        link = driver.link
+        hand.session.zenoh.declare_queryable(key("part", worker="hand"), held.append)
+        hand.answer(answer)
+        driver.until(lambda: held, "a question")
+        with light_worker(endpoint):
+            driver.until(lambda: len(link.dispatch.workers()) == 2, "the other worker")
+            driver.until(lambda: link.dispatch.reassigned() == ["beam"], "the job to be free")
+            driver.until(lambda: not link.dispatch.decoding, "the end of the fetch")
+            assert link.dispatch.reliability.failing_objects == {"beam"}, "it is held against who sent nothing"
+            hand.close()
+            assert is_right(driver.factor(BEAM, 2)) and driver.factors[0].worker == "light"

@@ -13,8 +13,9 @@ from sim_server.replay.log import Recording
 from sim_server.replay.run import Replay
 from sim_server.service.service import Service
 from sim_server.simulation import Simulation
+from tests.ports import free_endpoint
 from tests.system.hand_worker import HandWorker
-from tests.system.link_helpers import PATIENCE, free_endpoint
+from tests.system.link_helpers import PATIENCE
 from tests.system.server_process import beam, fresh, run, until
 
 pytestmark = pytest.mark.system

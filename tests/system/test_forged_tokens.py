@@ -9,13 +9,14 @@ from pathlib import Path
 import pytest
 import zenoh
 from hand_worker import HandWorker
-from link_helpers import Driver, chain, free_endpoint, light_worker, process
+from link_helpers import Driver, chain, light_worker, process
 
 from protocol.channels import PROTOCOL, key
 from protocol.messages_pb2 import Header, WorkerInfo
 from protocol.network.session import open_session
 from sim_server.network.link import ServerLink
 from sim_server.network.worker_registry import TOKENS, WORKERS
+from tests.ports import free_endpoint
 
 pytestmark = pytest.mark.system
 

@@ -7,13 +7,14 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 from hand_worker import HandWorker
-from link_helpers import DenseAnalysis, free_endpoint
+from link_helpers import DenseAnalysis
 
 from protocol.messages_pb2 import Factor, Topology
 from protocol.validate import checksum
 from sim_server.network.link import ServerLink
 from sim_server.recording import messages
 from sim_server.updates.driver import Driver
+from tests.ports import free_endpoint
 from tests.scenes import bar, simulation
 
 pytestmark = pytest.mark.system

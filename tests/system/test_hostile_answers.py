@@ -8,11 +8,12 @@ from collections.abc import Callable, Iterator
 import numpy as np
 import pytest
 from hand_worker import HandWorker, change
-from link_helpers import DenseAnalysis, Driver, chain, dense, free_endpoint, matrix, product
+from link_helpers import DenseAnalysis, Driver, chain, dense, matrix, product
 
 from protocol.messages_pb2 import Factor, FactorPattern, Matrix
 from sim_server.network.link import ServerLink
 from sim_server.updates.factor_source import Job
+from tests.ports import free_endpoint
 
 pytestmark = pytest.mark.system
 

@@ -18,7 +18,8 @@ import pytest
 from clients.client import Client
 from clients.errors import ClientError
 from sim_server.scene import load
-from tests.system.link_helpers import PATIENCE, ROOT, free_endpoint
+from tests.ports import free_endpoint
+from tests.system.link_helpers import PATIENCE, ROOT
 from tests.system.server_process import alive, until
 
 LAUNCH = ROOT / "deploy" / "launch.py"

@@ -5,10 +5,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from link_helpers import free_endpoint
 from server_process import beam, run
 
 from protocol.log_pieces import later_pieces
+from tests.ports import free_endpoint
 
 pytestmark = pytest.mark.system
 STEPS = 1000  # 8 MB, of which a file has 3 at most, however much waits when it is to end

@@ -14,6 +14,7 @@ from server_process import Stage, beam, fresh, run, until
 
 from protocol import messages_pb2 as pb
 from protocol.log_file import LogFile
+from tests.ports import free_port
 
 pytestmark = pytest.mark.system
 
@@ -25,12 +26,6 @@ def stage(tmp_path: Path) -> Iterator[Stage]:
     stage = Stage(tmp_path)
     yield stage
     stage.close()
-
-
-def free_port() -> int:
-    with socket.socket() as s:
-        s.bind(("127.0.0.1", 0))
-        return int(s.getsockname()[1])
 
 
 def get(port: int, path: str = "/metrics") -> str:

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from clients.log.reader import Log
-from tests.system.link_helpers import free_endpoint
+from tests.ports import free_endpoint
 from tests.system.server_process import Stage, run, until
 from tests.system.test_replay_of_a_server import CPU, replayed
 from tests.system.test_replay_of_a_server import messages as logged

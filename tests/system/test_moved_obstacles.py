@@ -12,7 +12,7 @@ from clients.errors import BadInput
 from clients.log.reader import Log
 from protocol import messages_pb2 as pb
 from tests.contact_scene import DT
-from tests.system.link_helpers import free_endpoint
+from tests.ports import free_endpoint
 from tests.system.server_process import Stage, fresh, run, until
 from tests.system.test_replay_of_a_server import CPU, copied, replayed
 from tests.system.test_replay_of_a_server import messages as logged

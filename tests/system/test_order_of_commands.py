@@ -16,8 +16,8 @@ from sim_server.replay.run import Replay
 from sim_server.service.service import Service
 from sim_server.simulation import Simulation
 from sim_server.state.start import Start
+from tests.ports import free_endpoint
 from tests.resets.state_scenes import made
-from tests.system.link_helpers import free_endpoint
 from tests.system.server_process import beam, until
 
 pytestmark = pytest.mark.system

@@ -9,7 +9,7 @@ import pytest
 from sim_server.network.link import ServerLink
 from sim_server.service.service import Service
 from sim_server.simulation import Simulation
-from tests.system.link_helpers import free_endpoint
+from tests.ports import free_endpoint
 from tests.system.server_process import Stage, beam, fresh, run, until
 
 pytestmark = pytest.mark.system

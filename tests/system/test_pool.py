@@ -8,11 +8,12 @@ from collections.abc import Iterator
 
 import pytest
 import zenoh
-from link_helpers import PATIENCE, ROOT, Driver, chain, free_endpoint, light_worker, matrix, process
+from link_helpers import PATIENCE, ROOT, Driver, chain, light_worker, matrix, process
 
 from protocol.network.session import open_session
 from sim_server.network.link import ServerLink
 from sim_server.updates.factor_source import Job
+from tests.ports import free_endpoint
 
 pytestmark = pytest.mark.system
 

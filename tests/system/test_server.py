@@ -18,8 +18,9 @@ from clients.errors import BadInput
 from clients.export.export import export
 from clients.log.reader import Log
 from protocol import messages_pb2 as pb
+from tests.ports import free_endpoint
 from tests.support.commands import in_turn
-from tests.system.link_helpers import ROOT, free_endpoint
+from tests.system.link_helpers import ROOT
 from tests.system.server_process import Stage, alive, beam, fresh, run, until
 
 pytestmark = pytest.mark.system

@@ -6,13 +6,14 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from link_helpers import PATIENCE, Driver, chain, free_endpoint, light_worker
+from link_helpers import PATIENCE, Driver, chain, light_worker
 from server_process import Process, Stage, beam, fresh, until
 
 from protocol.channels import key
 from protocol.network.session import open_session
 from sim_server.errors import NameTaken
 from sim_server.network.link import ServerLink
+from tests.ports import free_endpoint
 
 pytestmark = pytest.mark.system
 

@@ -12,11 +12,12 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from link_helpers import ROOT, free_endpoint
+from link_helpers import ROOT
 from server_process import Stage, beam, fresh
 
 from protocol.process.notify import Notifier
 from sim_server.service.health import Health
+from tests.ports import free_endpoint
 
 pytestmark = pytest.mark.system
 UNITS = ROOT / "deploy" / "systemd"

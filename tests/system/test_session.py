@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import zenoh
 from hand_worker import HandWorker
-from link_helpers import ROOT, Driver, chain, dense, free_endpoint, light_worker, matrix, process, product
+from link_helpers import ROOT, Driver, chain, dense, light_worker, matrix, process, product
 
 from protocol.channels import DEFAULT_ENDPOINT, key
 from protocol.messages_pb2 import Status
@@ -19,6 +19,7 @@ from protocol.network.endpoints import BadEndpoint
 from protocol.network.session import EXTRA_CONFIG, ConnectionFailed, open_session
 from protocol.shared_memory import limits as shm_limits
 from sim_server.network.link import ServerLink
+from tests.ports import free_endpoint
 
 pytestmark = pytest.mark.system
 

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from clients.log.reader import Log
-from tests.system.link_helpers import free_endpoint
+from tests.ports import free_endpoint
 from tests.system.server_process import run
 from tests.system.test_replay_of_a_server import CPU, replayed
 

@@ -9,9 +9,10 @@ import time
 from pathlib import Path
 
 import pytest
-from link_helpers import ROOT, free_endpoint, process
+from link_helpers import ROOT, process
 
 from sim_server.network.link import ServerLink
+from tests.ports import free_endpoint
 from tests.support.commands import Ended, in_turn
 
 pytestmark = pytest.mark.system

@@ -5,10 +5,11 @@ import resource
 from pathlib import Path
 
 import pytest
-from link_helpers import Driver, chain, free_endpoint, process
+from link_helpers import Driver, chain, process
 
 from protocol.process.exhausted import exhausted
 from sim_server.network.link import ServerLink
+from tests.ports import free_endpoint
 
 pytestmark = pytest.mark.system
 

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 import zenoh
 from hand_worker import HandWorker
-from link_helpers import Driver, chain, dense, free_endpoint, light_worker, matrix, process, product
+from link_helpers import Driver, chain, dense, light_worker, matrix, process, product
 
 from protocol import messages_pb2 as pb
 from protocol.refused import Refused
@@ -25,6 +25,7 @@ from protocol.shared_memory.pool import Slot
 from sim_server.network import factor_intake, worker_choice
 from sim_server.network.link import ServerLink
 from sim_server.updates.factor_source import Job
+from tests.ports import free_endpoint
 
 pytestmark = pytest.mark.system
 shared = pytest.mark.skipif(bool(shm_limits.obstacle()), reason=f"no shared memory here: {shm_limits.obstacle()}")

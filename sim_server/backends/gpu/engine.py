@@ -34,6 +34,7 @@ from sim_server.backends.gpu.loop import CAPACITY, MANY, DeviceLoop
 from sim_server.backends.gpu.mailbox import ChangeMailbox, DeviceMailbox
 from sim_server.backends.gpu.measured import MeasuredReport
 from sim_server.backends.gpu.newton import NewtonIteration, NewtonPhases, begins_beside
+from sim_server.backends.gpu.pinned import pinned_array
 from sim_server.backends.gpu.refresh import LocalRefresh
 from sim_server.backends.gpu.rosenbrock import ATTEMPTS, RosenbrockStep
 from sim_server.backends.gpu.solver import PCG_BODY, SETTINGS_BYTES, PcgSolver
@@ -56,6 +57,7 @@ from sim_server.backends.state import StateArray
 MOST_GRABS = 1024  # pushes and grabs at a time, of which forces are told
 MOST_TOLD = 16  # other bodies whose forces on a body are told, at most
 GRAB_BLOCKS, GRAB_THREADS = 32, 128  # of the kernel react (effects/touch.cu)
+PREPARED_WITHIN = 1.0  # s in which an inverse that is prepared for a check is begun, else the check goes without
 FEW = 16  # largest number of trials in a step without loops for which MANY steps are captured in one graph
 EPILOGUE = Declarations("backends/gpu/step_epilogue.cu")
 STEP_EPILOGUE = EPILOGUE.dtype("StepEpilogue")
@@ -480,6 +482,27 @@ class GpuEngine(DeviceLoop):
         patterns are known from earlier runs."""
         self.solver.compile_builder()
         self._patterns.plan()
+
+    def prepare_factor(self, body: int, factor: Factor, r: Float64) -> Callable[[], Float64 | None]:
+        """Builds the inverse of a factor beside caller and steps, and applies it to r; returns what waits for that."""
+        coming = self._factor_upload.prepare(body, factor.pattern, factor.values, factor.step, r)
+
+        def applied() -> Float64 | None:
+            try:
+                found = coming.result(PREPARED_WITHIN)
+            except TimeoutError:  # a factor before it waits for a step, as in a pause
+                return None
+            return found.result() if found is not None else None
+
+        return applied
+
+    def drop_factor(self, body: int, factor: Factor) -> None:
+        """Gives up a factor that may have been prepared, and is not posted."""
+        self._factor_upload.drop(body, factor.values)
+
+    def factor_memory(self, count: int, dtype: np.dtype[Any]) -> NDArray[Any]:
+        """Makes an array for values of a factor, from which the device copies them."""
+        return pinned_array(self.gpu.cp, count, dtype)
 
     def expect_factors(self, body: int, pattern: FactorPattern) -> None:
         """Begins to plan the inverses of factors of a pattern that will come, beside the caller."""

@@ -5,12 +5,16 @@ Each body has two storages per pattern (double buffering). A build begins once t
 step under way reads the other storage. A factor that arrives earlier is queued; a newer one replaces it. Plans, made
 once per pattern, and the copies of large factors, or of many, are left to a thread (PcgSolver.beside), for which the
 thread that serves the loop does not wait.
+
+A factor may be *prepared* while it is checked: its inverse is built, applied once for the check, and kept out of use
+until the factor is posted, or dropped.
 """
 
 import logging
 import threading
 from collections.abc import Callable, Sequence
-from concurrent.futures import Future, wait
+from concurrent.futures import Future, InvalidStateError, wait
+from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any, NamedTuple
@@ -18,8 +22,10 @@ from typing import Any, NamedTuple
 from numpy.typing import NDArray
 
 from protocol.factor import FactorPattern
+from sim_server.arrays import Float64
 from sim_server.backends.compiler import CompileError
 from sim_server.backends.gpu.device import Gpu, no_memory_left
+from sim_server.backends.gpu.inverse.apply_inverse import Applied
 from sim_server.backends.gpu.inverse.build_inverse import InverseStorage, PartitionedInverse
 from sim_server.backends.gpu.loop import DeviceLoop
 from sim_server.backends.gpu.mailbox import DeviceMailbox
@@ -29,6 +35,7 @@ log = logging.getLogger(__name__)
 
 SMALL = 1 << 20  # bytes of a factor that is copied at once
 MANY = 4  # small factors that come together, from which on none is built at once
+BUSY = 0.25  # share of dt that steps in real time take, up to which builds may have the whole device
 MAX_PATTERNS = 2  # of a body at a time; workers with different libraries send different patterns
 
 
@@ -41,12 +48,33 @@ class UploadedFactor(NamedTuple):
     pattern: FactorPattern
 
 
-class GivenFactor(NamedTuple):
-    """A factor that came. Its values do not change any more."""
+@dataclass(eq=False)
+class GivenFactor:
+    """A factor that came. Its values do not change any more.
+
+    r: vector that its inverse is to be applied to. None: to none
+    applied: P^-1 r on its way; None: nobody applies it
+    wanted: it is to be used; False: once it is posted
+    dropped: nobody wants it any more
+    """
 
     pattern: FactorPattern
     values: NDArray[Any]
     step: int
+    r: Float64 | None = None
+    applied: "Future[Applied | None]" = field(default_factory=Future)
+    wanted: bool = True
+    dropped: bool = False
+
+    def drop(self) -> None:
+        """Gives it up."""
+        self.dropped = True
+        self.tell(None)
+
+    def tell(self, applied: Applied | None) -> None:
+        """Tells who waits for P^-1 r, if it is not told yet."""
+        with suppress(InvalidStateError):
+            self.applied.set_result(applied)
 
 
 @dataclass
@@ -57,6 +85,7 @@ class BodyUploads:
     leaving: the factor in use before, and the number of steps after whose completion no step reads it
     posted: not taken by the loop yet
     building: in the thread of the plans, and the factor that it is of
+    built: prepared, and the factor that it is of, which is neither posted nor dropped yet
     queued: a factor that waits for a storage, or for that thread
     warned: True after the first factor that could not be used
     """
@@ -68,13 +97,14 @@ class BodyUploads:
     leaving: tuple[UploadedFactor, int] | None = None
     posted: UploadedFactor | None = None
     building: tuple[Future[UploadedFactor], GivenFactor] | None = None
+    built: tuple[UploadedFactor, GivenFactor] | None = None
     queued: GivenFactor | None = None
     warned: bool = False
 
     @property
     def free(self) -> bool:
         """True if a build may begin: a storage is free, or will be made."""
-        return self.posted is None and self.leaving is None and self.building is None
+        return self.posted is None and self.leaving is None and self.building is None and self.built is None
 
     @property
     def patterns(self) -> set[int]:
@@ -110,10 +140,64 @@ class FactorUpload:
         any more.
         """
         with self._lock:
+            self._refresh(body)
+            if not self._use_prepared(body, values):
+                self._enqueue(body, GivenFactor(pattern, values, step))
+                self._begin_queued(body)
+
+    def prepare(
+        self, body: int, pattern: FactorPattern, values: NDArray[Any], step: int, r: Float64
+    ) -> "Future[Applied | None]":  # fmt: skip
+        """Builds the inverse of a factor, beside the caller, and applies it to r (n,); it is used once these very
+        values are posted. Returns P^-1 r; None as its result if it comes to nothing."""
+        given = GivenFactor(pattern, values, step, r, wanted=False)
+        with self._lock:
+            self._refresh(body)
+            self._enqueue(body, given)
+            self._begin_queued(body, beside=True)
+        return given.applied
+
+    def drop(self, body: int, values: NDArray[Any]) -> None:
+        """Gives up a factor that was prepared and not posted; any other one is let alone."""
+        with self._lock:
             uploads = self._uploads[body]
             self._refresh(body)
-            uploads.queued = GivenFactor(pattern, values, step)
+            given = self._prepared(uploads, values)
+            if given is None:
+                return
+            given.drop()
+            if uploads.built is not None and uploads.built[1] is given:
+                uploads.built = None
+            if uploads.queued is given:
+                uploads.queued = None
             self._begin_queued(body)
+
+    def _prepared(self, uploads: BodyUploads, values: NDArray[Any]) -> GivenFactor | None:
+        """Returns the factor with these values that is prepared and not posted."""
+        coming = (uploads.queued, *(each[1] for each in (uploads.building, uploads.built) if each is not None))
+        return next((each for each in coming if each is not None and not each.wanted and each.values is values), None)
+
+    def _use_prepared(self, body: int, values: NDArray[Any]) -> bool:
+        """Has a prepared factor used, at once if it is built; False if there is none with these values."""
+        uploads = self._uploads[body]
+        given = self._prepared(uploads, values)
+        if given is None:
+            return False
+        given.wanted = True
+        if uploads.built is not None and uploads.built[1] is given:
+            (factor, _), uploads.built = uploads.built, None
+            self._finish(body, given, lambda: factor)
+        return True
+
+    def _enqueue(self, body: int, given: GivenFactor) -> None:
+        """Puts a factor in the place of the one that waits, or that waits to be posted."""
+        uploads = self._uploads[body]
+        if uploads.queued is not None:
+            uploads.queued.drop()
+        if uploads.built is not None:
+            uploads.built[1].drop()
+            uploads.built = None
+        uploads.queued = given
 
     def post_many(self, given: Sequence[tuple[int, FactorPattern, NDArray[Any], int]]) -> None:
         """Takes factors of different bodies, each as `post` takes one. Inverses of many are built beside the caller,
@@ -121,8 +205,9 @@ class FactorUpload:
         with self._lock:
             for body, pattern, values, step in given:
                 self._refresh(body)
-                self._uploads[body].queued = GivenFactor(pattern, values, step)
-                self._begin_queued(body, len(given) >= MANY)
+                if not self._use_prepared(body, values):
+                    self._enqueue(body, GivenFactor(pattern, values, step))
+                    self._begin_queued(body, len(given) >= MANY)
 
     def advance(self) -> None:
         """Posts what was built beside the caller, and begins the builds that have waited for a storage."""
@@ -144,6 +229,7 @@ class FactorUpload:
             uploads = self._uploads[body]
             self._refresh(body)
             if uploads.queued is not None and uploads.building is None:
+                uploads.built = None
                 if uploads.posted is not None and uploads.mailbox.withdraw():
                     uploads.posted.inverse.event.synchronize()  # its storage may be reused
                     uploads.posted = None
@@ -168,7 +254,7 @@ class FactorUpload:
         uploads = self._uploads[body]
         if uploads.building is not None and uploads.building[0].done():
             (future, given), uploads.building = uploads.building, None
-            self._finish(body, given.pattern, future.result)
+            self._finish(body, given, future.result)
         if uploads.posted is not None and uploads.mailbox.taken:
             if uploads.in_use is not None:  # steps launched until now may still read it
                 uploads.leaving = (uploads.in_use, int(self._loop.loop.launched))
@@ -195,7 +281,7 @@ class FactorUpload:
         spare = next((s for s in uploads.storages.get(given.pattern.id, []) if s is not used), None)
         build = partial(self._build, plan, given, spare)
         if plan.done() and given.values.nbytes <= SMALL and not beside:
-            self._finish(body, given.pattern, build)
+            self._finish(body, given, build)
         else:
             uploads.building = self._solver.beside(build), given
 
@@ -203,19 +289,36 @@ class FactorUpload:
         self, plan: Future[PlannedInverse], given: GivenFactor, spare: InverseStorage | None
     ) -> UploadedFactor:  # fmt: skip
         """Begins to build an inverse in a storage, a new one unless there is one to spare. The plan is made."""
-        builder = plan.result().builder
-        storage = builder.storage() if spare is None else spare
-        self._gpu.cp.cuda.get_current_stream().synchronize()  # new arrays are complete for other streams
-        inverse = builder.build(given.values, storage, self._solver.spared)  # beside the steps
+        try:
+            builder, multiprocessors = plan.result().builder, self._multiprocessors
+            storage = builder.storage() if spare is None else spare
+            self._gpu.cp.cuda.get_current_stream().synchronize()  # new arrays are complete for other streams
+            inverse = builder.build(given.values, storage, multiprocessors)  # beside the steps
+            if given.r is not None:
+                given.tell(builder.apply(inverse, given.r, multiprocessors))
+        finally:
+            given.tell(None)
         return UploadedFactor(inverse, storage, given.step, given.pattern)
 
-    def _finish(self, body: int, pattern: FactorPattern, build: Callable[[], UploadedFactor]) -> None:
-        """Posts the factor that `build` returns, or warns if it cannot be used."""
+    @property
+    def _multiprocessors(self) -> int | None:
+        """Multiprocessors that a build may keep busy: those that solves leave free; None: all, where steps in real time
+        leave the device idle most of the time. A step then waits some 100 us now and then, and the build is done the
+        sooner."""
+        loop = self._loop.loop
+        idle = loop.realtime and 0 < loop.step_seconds < BUSY * loop.dt
+        return None if idle else self._solver.spared
+
+    def _finish(self, body: int, given: GivenFactor, build: Callable[[], UploadedFactor]) -> None:
+        """Posts the factor that `build` returns, if it is wanted already, or warns if it cannot be used."""
         uploads = self._uploads[body]
         try:
             factor = build()
             self._keep(uploads, factor)
-            self._solver.use(body, pattern, factor.inverse, factor.step)
+            if not given.wanted:
+                uploads.built = None if given.dropped else (factor, given)
+                return
+            self._solver.use(body, given.pattern, factor.inverse, factor.step)
         except (ValueError, CompileError) as error:
             self._warn(uploads, str(error))
             return

@@ -20,7 +20,8 @@ from sim_server.service.supervisor import Supervisor
 from tests.bench.faults.net import ADDRESS, Cable
 from tests.bench.harness.schemes import SCENES
 from tests.bench.harness.report import ROOT
-from tests.ports import free_port
+from tests.ports import free_endpoint
+from tests.support.link import link_of
 
 CELLS = {540: (3, 3, 10), 3000: (5, 5, 20), 24000: (10, 10, 40)}  # of sofa_beam.toml
 SHARED, BYTES, GIGABIT = "shared memory", "bytes, same host", "1 Gbit/s"
@@ -72,11 +73,9 @@ def measured(case: Case, steps: int) -> dict[str, Any]:
     """The row of a case, counted from the third factor on (none: from the first)."""
     sim = case.simulation()
     far = case.way == GIGABIT
-    endpoint = f"tcp/{ADDRESS if far else '127.0.0.1'}:{free_port()}"
+    endpoint = free_endpoint(ADDRESS if far else "127.0.0.1")
     prefix = Cable.far if far else ()
-    with ServerLink("bench", [endpoint], shared_memory=case.way == SHARED) as link:
-        link.set_scene(messages.scene(sim))
-        link.announce(messages.topology(sim, sim.world.bodies[0]))
+    with link_of(sim, endpoint, "bench", shared_memory=case.way == SHARED) as link:
         workers = Supervisor(1, "bench", [endpoint], start=lambda command: started([*prefix, *command]))
         try:
             until(link.dispatch.workers)

@@ -12,7 +12,6 @@ import os
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import argparse
-import socket
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -23,7 +22,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim_server.network.link import ServerLink
-from sim_server.recording import messages
 from sim_server.service.supervisor import Supervisor
 from sim_server.simulation import Simulation
 from sim_server.updates.driver import Driver
@@ -33,6 +31,8 @@ from tests.bench.cpu import transients
 from tests.bench.cpu.scipy_step import ScipyStep
 from tests.bench.harness.pieces import Merged, Piece, arguments_of_pieces, say, shown
 from tests.bench.harness.report import ROOT, Report, plots
+from tests.ports import free_endpoint
+from tests.support.link import link_of
 
 SCENE = ROOT / "deploy" / "scenes" / "sofa_beam.toml"
 CELLS = {540: (3, 3, 10), 3000: (5, 5, 20), 7350: (7, 7, 25), 24000: (10, 10, 40), 98304: (16, 16, 64)}
@@ -81,12 +81,8 @@ def alone(preconditioner: str, update: str = "never") -> Callable[[int, int], di
 @contextmanager
 def worker_of(sim: Simulation) -> Iterator[ServerLink]:
     """A link with a worker process of its own that knows the scene."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
-    with ServerLink("bench", [endpoint]) as link:
-        link.set_scene(messages.scene(sim))
-        link.announce(messages.topology(sim, sim.world.bodies[0]))
+    endpoint = free_endpoint()
+    with link_of(sim, endpoint, "bench") as link:
         workers = Supervisor(1, "bench", [endpoint])
         try:
             while not link.dispatch.workers():

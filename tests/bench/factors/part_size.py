@@ -22,7 +22,7 @@ from protocol.network.session import Session, open_session
 from protocol.shared_memory.pool import SlotPool, SlotsUnusable
 from sim_server.network.factor_fetch import AHEAD, FactorFetch
 from sim_server.network.leases import InFlightJob
-from tests.ports import free_port
+from tests.ports import free_endpoint
 
 SIZES = tuple(1 << k for k in range(20, 27))
 COUNTERS = Counters(logging.getLogger(__name__))
@@ -31,7 +31,7 @@ Row = dict[str, Any]
 
 def measured(sizes: Sequence[int], size: int, rounds: int) -> list[Row]:
     """Returns a row for each way and size of parts [bytes]. size: of the factor [bytes]"""
-    where = [f"tcp/127.0.0.1:{free_port()}"]
+    where = [free_endpoint()]
     values = np.random.default_rng(0).standard_normal(size // 4, np.float32)
     times: dict[tuple[str, int], list[tuple[float, float]]] = {}
     with open_session("server", listen=where) as server, open_session("client", connect=where) as client:

@@ -20,7 +20,7 @@ from typing import Any
 from clients.client import Client
 from clients.errors import ClientError
 from tests.bench.gpu.problem import BARS, Problem
-from tests.ports import free_port
+from tests.ports import free_endpoint
 
 Row = dict[str, Any]
 
@@ -30,7 +30,7 @@ def steps(cells: Sequence[int], seconds: float, options: Sequence[str] = ()) -> 
     with tempfile.TemporaryDirectory() as folder:
         usual = next(iter(BARS))
         scene = Problem(usual).write(Path(folder))
-        endpoint = f"tcp/127.0.0.1:{free_port()}"
+        endpoint = free_endpoint()
         server = subprocess.Popen(
             [sys.executable, "-m", "sim_server", str(scene), "--device", "cpu", "--free-run", "--workers", "1",
              "--listen", endpoint, "--set", f"object.beam0.mesh.bar={list(cells)}", "--set", "solver.first_factor=go",

@@ -18,7 +18,7 @@ from clients.errors import BadInput, ClientError
 from clients.log.reader import Log
 from tests.bench.harness.pieces import Merged
 from tests.bench.harness.report import ROOT, Report
-from tests.ports import free_port
+from tests.ports import free_endpoint
 
 TITLE = "Dragging the creature"
 CREATURE = "creature"
@@ -95,7 +95,7 @@ def measured(name: str, solver: str, device: str, steps: int) -> dict[str, Any]:
     """Returns a row."""
     warm = steps // 4
     with tempfile.TemporaryDirectory(prefix="warpfactor-gallery-") as folder:
-        log, endpoint = Path(folder) / "run.mcap", f"tcp/127.0.0.1:{free_port()}"
+        log, endpoint = Path(folder) / "run.mcap", free_endpoint()
         words = [f"gallery/{name}", "--free-run", "--workers", "1", "--steps", str(steps + warm), "--quiet"]
         words += ["--device", device, "--worker-device", "auto", "--record", str(log), "--listen", endpoint]
         words += [word for override in SOLVERS[solver] for word in ("--set", override)]

@@ -7,7 +7,6 @@ factor made before that helps after it as any old one does.
 """
 
 import inspect
-import socket
 import tempfile
 import threading
 import time
@@ -18,15 +17,15 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_server.network.link import ServerLink
-from sim_server.recording import messages
 from sim_server.service.service import ROUND_PERIOD
 from sim_server.service.supervisor import Supervisor
 from sim_server.simulation import Simulation
 from sim_server.updates.driver import Driver
 from sim_server.updates.factor_source import Job
 from tests.bench.gpu.problem import Problem
+from tests.ports import free_endpoint
 from tests.state import put
+from tests.support.link import link_of
 
 SWING = 100  # steps until the beam is put back
 PATIENCE = 60.0  # s for a worker to join, for a first factor to come
@@ -48,16 +47,11 @@ class Served:
     def __init__(self, sim: Simulation, worker: str):
         self.sim, self.engine, self._worker = sim, sim.engine, worker
         self._start = sim.fetch().x.copy()
-        with socket.socket() as probe:
-            probe.bind(("127.0.0.1", 0))
-            self._endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+        self._endpoint = free_endpoint()
         self._ended = False
 
     def __enter__(self) -> Self:
-        body = self.sim.world.bodies[0]
-        self.link = ServerLink("bench", [self._endpoint])
-        self.link.set_scene(messages.scene(self.sim))
-        self.link.announce(messages.topology(self.sim, body))
+        self.link = link_of(self.sim, self._endpoint, "bench")
         arguments = ("--device", "gpu") if self._worker == "gpu" else ()
         self._supervisor = Supervisor(1, "bench", [self._endpoint], arguments)
         self.driver = Driver(self.sim, self.link.dispatch)

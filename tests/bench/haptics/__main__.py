@@ -17,7 +17,7 @@ import typer
 from clients.client import Client
 from clients.errors import ClientError
 from tests.bench.harness.report import ROOT, Report, plots
-from tests.ports import free_port
+from tests.ports import free_endpoint
 
 SCENE = ROOT / "deploy" / "scenes" / "haptics.toml"
 PATIENCE = 60.0  # s for the server, and for its first factor
@@ -41,7 +41,7 @@ EXPLAINED = (
 @contextmanager
 def server(dt: float, folder: Path) -> Iterator[tuple[Client, str]]:
     """A server in real time with a worker whose factor is in use, and a client of it."""
-    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    endpoint = free_endpoint()
     words = [str(SCENE), "--set", f"dt={dt}", "--listen", endpoint, "--workers", "1", "--device", "cpu", "--quiet"]
     with (folder / "server.log").open("ab") as out:
         process = subprocess.Popen([sys.executable, "-m", "sim_server", *words], cwd=ROOT, stdout=out, stderr=out)

@@ -190,7 +190,7 @@ class Report:
         sizes = "200, 80 k nonzeros; smoke run" if self.quick else "1000, 800 k nonzeros"
         lines = [
             f"# {self.title}",
-            f"`deploy/run bench {self.name}`, {_words(self.arguments)}",
+            ", ".join([f"`deploy/run bench {self.name}`", *(f"{k} = {_list(v)}" for k, v in self.arguments.items())]),
             f"- {header['date']}, commit {header['commit']}",
             f"- {m['cpu']}, {m['cores']} cores, governor {m['governor']}, load {m['load']} at the start; {m['system']}",
             "- " + ", ".join(f"{k} {v}" for k, v in header["versions"].items()),
@@ -215,10 +215,6 @@ class Report:
         """NAME.json alone."""
         content = {"header": header, "arguments": self.arguments, "data": self.data}
         (self.folder / f"{self.name}.json").write_text(json.dumps(plain(content), indent=1, allow_nan=False) + "\n")
-
-
-def _words(arguments: dict[str, Any]) -> str:
-    return ", ".join(f"{k} = {_list(v)}" for k, v in arguments.items())
 
 
 def _list(value: Any) -> str:

@@ -13,7 +13,7 @@ from protocol import messages_pb2 as pb
 from sim_server.simulation import Simulation
 from sim_server.updates.driver import Driver
 from tests.bench.harness.report import ROOT
-from tests.ports import free_port
+from tests.ports import free_endpoint
 
 Reals = NDArray[np.float64]
 SCENES = ROOT / "deploy" / "scenes"
@@ -70,7 +70,7 @@ def _in_processes(scene: Path, scheme: Scheme, steps: int, more: tuple[str, ...]
     path = folder / "run.mcap"
     command = [sys.executable, "-m", "sim_server", str(scene), "--steps", str(steps), "--workers", "1"]
     command += ["--realtime" if scheme.realtime else "--free-run"]
-    command += ["--record", str(path), "--listen", f"tcp/127.0.0.1:{free_port()}", "--name", "bench", "--quiet"]
+    command += ["--record", str(path), "--listen", free_endpoint(), "--name", "bench", "--quiet"]
     for override in scheme.overrides(*more):
         command += ["--set", override]
     subprocess.run(command, check=True, cwd=ROOT, timeout=600)

@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 
 from protocol.factor import Factor
 from sim_server.network.link import ServerLink
-from sim_server.recording import messages
 from sim_server.service.supervisor import Supervisor
 from sim_server.simulation import Simulation
 from sim_server.updates.driver import Driver
@@ -27,7 +26,8 @@ from tests.bench.build.runs import started, until
 from tests.bench.harness.cores import Cores
 from tests.bench.paper.beam import COROTATIONAL, LOADS, Beam, calibrated
 from tests.bench.paper.tables import Row, Setting
-from tests.ports import free_port
+from tests.ports import free_endpoint
+from tests.support.link import link_of
 
 STRETCH = 50  # steps in turn
 COLD = 2  # first steps of a stretch, left out
@@ -114,10 +114,8 @@ def one_round(beam: Beam, setting: Setting, steps: int, cores: Cores) -> Pair:
     """A server with a worker process, from rest."""
     solver = {"preconditioner": "cholesky", "update": "async", "warp": True, **setting.solver()}
     sim, twin = (beam.simulation(LOADS[1], **solver) for _ in range(2))
-    endpoint = f"tcp/127.0.0.1:{free_port()}"
-    with ServerLink("bench", [endpoint]) as link:
-        link.set_scene(messages.scene(sim))
-        link.announce(messages.topology(sim, sim.world.bodies[0]))
+    endpoint = free_endpoint()
+    with link_of(sim, endpoint, "bench") as link:
 
         def start(command: Any) -> Any:
             process = started(command)

@@ -15,7 +15,6 @@ import os
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import argparse
-import socket
 import tempfile
 import threading
 import time
@@ -26,15 +25,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim_server.errors import DeviceError
-from sim_server.network.link import ServerLink
-from sim_server.recording import messages
 from sim_server.service.service import ROUND_PERIOD
 from sim_server.service.supervisor import Supervisor
 from sim_server.simulation import Simulation
 from sim_server.updates.driver import Driver
 from tests.bench.harness.pieces import Limit, Merged, Piece, arguments_of_pieces, say, shown
 from tests.bench.scaling import page
+from tests.ports import free_endpoint
 from tests.state import put
+from tests.support.link import link_of
 
 OBJECTS, WORKERS = (1, 4, 16, 64, 256, 1024), (1, 2, 4)
 DEVICES = ("cpu", "gpu")
@@ -77,13 +76,8 @@ class Run:
     def __init__(self, sim: Simulation, workers: int, worker_device: str):
         self.sim, self.engine, self.workers = sim, sim.engine, workers
         self._start = sim.fetch().x.copy()
-        with socket.socket() as probe:
-            probe.bind(("127.0.0.1", 0))
-            endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
-        self.link = ServerLink("bench", [endpoint])
-        self.link.set_scene(messages.scene(sim))
-        for body in sim.world.bodies:
-            self.link.announce(messages.topology(sim, body))
+        endpoint = free_endpoint()
+        self.link = link_of(sim, endpoint, "bench")
         self._supervisor = Supervisor(workers, "bench", [endpoint], ["--device", worker_device])
         self.driver = Driver(sim, self.link.dispatch)
         self._thread = threading.Thread(target=self._loop)

@@ -6,7 +6,6 @@ copies the matrices that were asked for. The rest is the product: the driver, th
 own (instant_worker.py), shared memory, checks, mailboxes.
 """
 
-import socket
 import subprocess
 import sys
 import tempfile
@@ -22,12 +21,12 @@ from numpy.typing import NDArray
 from protocol.factor import Factor
 from sim_server.backends.cpu.structs import RECORD
 from sim_server.backends.kinds import Kind
-from sim_server.network.link import ServerLink
-from sim_server.recording import messages
 from sim_server.service.service import ROUND_PERIOD
 from sim_server.simulation import Simulation
 from sim_server.updates.driver import Driver
 from tests.bench.gpu.problem import Problem
+from tests.ports import free_endpoint
+from tests.support.link import link_of
 
 MOST_STEPS = 8  # that are reported together, as the ring of a loop with a thousand bodies holds
 SWING = 100.0  # steps in which an old factor becomes useless
@@ -105,13 +104,8 @@ class Served:
         with tempfile.TemporaryDirectory() as folder:
             sim = Simulation.load(Problem(tets, beams=beams).write(Path(folder)))
         self.loop = sim.engine = PacedLoop(sim, rate)
-        with socket.socket() as probe:
-            probe.bind(("127.0.0.1", 0))
-            endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
-        self.link = ServerLink("bench", [endpoint])
-        self.link.set_scene(messages.scene(sim))
-        for body in sim.world.bodies:
-            self.link.announce(messages.topology(sim, body))
+        endpoint = free_endpoint()
+        self.link = link_of(sim, endpoint, "bench")
         self.driver = Driver(sim, self.link.dispatch)
         module = "tests.bench.service.instant_worker" if instant else "precond_worker"
         self._command = [sys.executable, "-m", module, "--connect", endpoint, "--server", "bench", "--name", "instant"]

@@ -22,7 +22,7 @@ from clients.web.view import home, up_of
 from tests.bench.harness.report import ROOT, Report, plots
 from tests.bench.web.player import Player
 from tests.bench.web.watcher import frames, jump, still, watched
-from tests.ports import free_port
+from tests.ports import free_endpoint, free_port
 from tests.support.browser import browser, missing, on_screen
 
 BEAM = ROOT / "deploy" / "scenes" / "beam.toml"
@@ -80,7 +80,7 @@ def page(endpoint: str, folder: Path) -> Iterator[str]:
 @contextlib.contextmanager
 def served(folder: Path, *settings: str, scene: Path = BEAM) -> Iterator[tuple[Client, str]]:
     """A server with a worker whose factor is in use, and a client of it; its endpoint."""
-    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    endpoint = free_endpoint()
     words = [word for setting in settings for word in ("--set", setting)]
     log = folder / "server.log"
     with process(

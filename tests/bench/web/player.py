@@ -13,7 +13,7 @@ from google.protobuf.message import Message
 from protocol import messages_pb2 as pb
 from protocol.channels import PROTOCOL, everything, key
 from protocol.network.session import open_session
-from tests.ports import free_port
+from tests.ports import free_endpoint
 
 RATE = 30.0  # frames a second, as a server sends them
 NAME, SHEET = "sim", "sheet"
@@ -29,7 +29,7 @@ class Player:
         a = (np.arange(side - 1)[:, None] * side + np.arange(side - 1)).ravel()
         corners = [np.stack([a, a + 1, a + side], 1), np.stack([a + 1, a + side + 1, a + side], 1)]
         self._triangles = np.concatenate(corners).astype("<i4")
-        self.endpoint = f"tcp/127.0.0.1:{free_port()}"
+        self.endpoint = free_endpoint()
         self._stop = threading.Event()
 
     def __enter__(self) -> Self:

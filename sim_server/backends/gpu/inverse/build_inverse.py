@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
 """Builds the partitioned inverse (plan.py) from the values of L on the device, beside the running steps.
 
-A build is one copy from pinned memory and one launch of a graph of the kernels in build_inverse.cu. Memory is allocated
-only when an InverseBuilder or an InverseStorage is made.
+A build is a copy or two from pinned memory and one launch of a graph of the kernels in build_inverse.cu. Memory is
+allocated only when an InverseBuilder or an InverseStorage is made.
 """
 
 from typing import Any, NamedTuple
@@ -11,12 +11,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from protocol.factor import FactorPattern
+from sim_server.arrays import Float64
 from sim_server.backends.gpu.cupy_types import DeviceArray, Event, Graph, KernelFunction
 from sim_server.backends.gpu.device import Gpu
+from sim_server.backends.gpu.inverse.apply_inverse import Applied, InverseApplication, application_kernels
 from sim_server.backends.gpu.inverse.expansion_batches import EDGE, BuildBatch, workspace_layout
 from sim_server.backends.gpu.inverse.partition import COLUMNS, ROWS
 from sim_server.backends.gpu.inverse.plan import Plan
 from sim_server.backends.gpu.inverse.workspace import workspace
+from sim_server.backends.gpu.pinned import PinnedArray
 
 HEAD = 16  # bytes in front of the values: the two addresses of a storage
 Groups = tuple[int, int, int, int]
@@ -33,7 +36,8 @@ KERNELS: dict[str, Groups] = {
 
 
 def builder_kernels(gpu: Gpu) -> dict[str, KernelFunction]:
-    """Returns the kernels of build_inverse.cu by name, compiled. Raises CompileError."""
+    """Returns the kernels of build_inverse.cu by name, compiled, as is what applies inverses. Raises CompileError."""
+    application_kernels(gpu)
     return {name: gpu.module("backends/gpu/inverse/build_inverse.cu").function(name) for name in KERNELS}
 
 
@@ -72,6 +76,7 @@ class InverseBuilder:
         self._workspace = workspace(cp.cuda.Device().id)
         self._workspace.reserve(layout.size, HEAD + 4 * self._nonzeros)
         self._functions = builder_kernels(gpu)
+        self._application: InverseApplication | None = None
         self._graphs: dict[int | None, Graph] = {}
         self._generation = -1
         cp.cuda.get_current_stream().synchronize()  # the tables are there for the stream of builds, which does not wait
@@ -97,6 +102,14 @@ class InverseBuilder:
         with self._workspace.lock:
             return self._begin(values, storage, multiprocessors)
 
+    def apply(self, inverse: PartitionedInverse, r: Float64, multiprocessors: int | None = None) -> Applied:
+        """Begins to apply an inverse that a build under way makes to r (n,); returns before it is complete."""
+        with self._workspace.lock:
+            if self._application is None:
+                self._application = InverseApplication(self._gpu, self.plan)
+            most = multiprocessors or self._gpu.properties["multiProcessorCount"]
+            return self._application.begin(inverse.matrix, inverse.scale, r, self._workspace.stream, most)
+
     def _begin(
         self, values: NDArray[np.floating], storage: InverseStorage, multiprocessors: int | None
     ) -> PartitionedInverse:  # fmt: skip
@@ -106,12 +119,15 @@ class InverseBuilder:
         size = HEAD + 4 * self._nonzeros
         addresses = storage.matrix.data.ptr, storage.scale.data.ptr
         space.staging[:HEAD].view(np.uint64)[:] = addresses
-        space.staging[HEAD:size].view(np.float32)[:] = values
         graph, stream = self._graph(multiprocessors), space.stream
-        cp.cuda.runtime.memcpyAsync(
-            space.incoming.data.ptr, space.staging.ctypes.data, size, cp.cuda.runtime.memcpyHostToDevice, stream.ptr
-        )
-        space.copied = stream.record()
+        at, copy, kind = int(space.incoming.data.ptr), cp.cuda.runtime.memcpyAsync, cp.cuda.runtime.memcpyHostToDevice
+        if isinstance(values, PinnedArray) and values.dtype == np.float32 and values.flags.c_contiguous:
+            copy(at, space.staging.ctypes.data, HEAD, kind, stream.ptr)
+            copy(at + HEAD, values.ctypes.data, size - HEAD, kind, stream.ptr)
+        else:
+            space.staging[HEAD:size].view(np.float32)[:] = values
+            copy(at, space.staging.ctypes.data, size, kind, stream.ptr)
+        space.copied, space.source = stream.record(), values
         graph.launch(stream)
         return PartitionedInverse(*addresses, stream.record())
 
