@@ -1022,7 +1022,7 @@ __device__ __forceinline__ void PcgSolver::solve() {
 #endif
 #ifdef REFRESHED
                     if (kind == CHOLESKY && iterations == REFRESH_AFTER && !memory.refresh.used && r2 > memory.goal)
-                        due = slow = !(REFRESH_AFTER * log(r2 / memory.goal) < REFRESH_WORTH * log(first_r2 / r2));
+                        due = slow = !(power<REFRESH_AFTER>(r2 / memory.goal) < power<REFRESH_WORTH>(first_r2 / r2));
 #endif
                     if (usable(alpha) && isfinite(r2)) continue;
                     alpha = 0;

@@ -15,6 +15,14 @@ struct RefreshMemory {               // shared memory of a thread block
     float t[REFRESHED_FREEDOMS], s[REFRESHED_FREEDOMS];  // by slot; by pair
 };
 
+// a^N. Compared instead of logarithms, which would take registers.
+template <int N>
+__device__ __forceinline__ double power(double a) {
+    double product = 1;
+    for (int k = 0; k < N; ++k) product *= a;
+    return product;
+}
+
 // Entry of a block that is the i-th of its upper triangle.
 __device__ __forceinline__ int entry_of_upper(int i) { return i < 3 ? i : i < 5 ? i + 1 : 8; }
 

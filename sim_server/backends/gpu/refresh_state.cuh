@@ -12,7 +12,7 @@
 #include "pcg_structs.cuh"
 
 constexpr int REFRESH_AFTER = 6;         // iterations of a solve
-constexpr double REFRESH_WORTH = 10;     // iterations that it would still need without
+constexpr int REFRESH_WORTH = 10;        // iterations that it would still need without
 constexpr double CHANGED = 0.05;         // of a node's own block: smaller changes are ignored
 constexpr double CHANGED_STEP = 1.6;     // by which that grows until T has few enough nodes
 constexpr int CHANGED_LEVELS = 8;        // times that it may grow
