@@ -21,7 +21,6 @@ from sim_server.backends.gpu import contact as gpu_contact
 from sim_server.backends.gpu import solver as gpu_solver
 from sim_server.backends.gpu.contact import ContactPasses
 from sim_server.backends.gpu.correction import CORRECTED_BODY, FactorCorrection
-from sim_server.backends.gpu.refresh import REFRESHED_BODY, LocalRefresh
 from sim_server.backends.gpu.row_partition import assign_blocks
 from sim_server.backends.gpu.solver import PCG_RESULT, PcgSolver
 from sim_server.backends.gpu.structs import CONTACT_RESULT, PCG
@@ -39,7 +38,6 @@ extern "C" void solve(const PcgArguments* s, const Correction* k) {
                      {shared_vector, sizeof shared_vector}});
 }
 """
-REFRESHED_SOLVE = SOLVE.replace("Correction", "Refresh")
 STEP = """
 #include "contact.cu"
 #include "pcg.cu"
@@ -134,8 +132,8 @@ WORDS = [
 ]  # fmt: skip
 
 
-def compiled(folder: Path, text: str, *defined: str, variant: str = "CORRECTED") -> c.CDLL:
-    """Compiles a text that includes pcg.cu, without instructions of a GPU. variant: of its last argument"""
+def compiled(folder: Path, text: str, *defined: str) -> c.CDLL:
+    """Compiles a text that includes pcg.cu, without instructions of a GPU."""
     gpu = SOURCES / "backends/gpu"
     group, solver = (gpu / "block_group.cuh").read_text(), (gpu / "pcg.cu").read_text()
     for pattern, plain in WORDS:
@@ -148,7 +146,7 @@ def compiled(folder: Path, text: str, *defined: str, variant: str = "CORRECTED")
     headers = {"block_group.cuh": group, "pcg.cu": solver, "partitioned_inverse.cuh": INVERSE, "clock.cuh": CLOCK}
     for name, written in headers.items():
         (folder / name).write_text(written)
-    for name in ("spmv.cuh", "correction.cuh", "refresh.cuh", "pivots3.cuh", "contact.cu"):  # beside the other headers
+    for name in ("spmv.cuh", "correction.cuh", "contact.cu"):  # beside the other headers
         (folder / name).write_text((gpu / name).read_text())
     header, found = re.subn(r"CONTACT_THREADS = \d+", f"CONTACT_THREADS = {THREADS}",
                             (gpu / "device_contact.cuh").read_text())  # fmt: skip
@@ -156,7 +154,7 @@ def compiled(folder: Path, text: str, *defined: str, variant: str = "CORRECTED")
     (folder / "device_contact.cuh").write_text(header)
     (folder / "solver.cpp").write_text(f'#include "cuda_threads.h"\n{MORE}{text}')
     paths = [f"-I{p}" for p in (folder, TESTS / "backends", gpu, INCLUDE)]
-    words = [f"-D{d}" for d in ("real=double", f"THREADS={THREADS}", "PER_PROCESSOR=1", variant, *defined)]
+    words = [f"-D{d}" for d in ("real=double", f"THREADS={THREADS}", "PER_PROCESSOR=1", "CORRECTED", *defined)]
     command = [compiler(), "-std=c++20", "-O1", "-shared", "-fPIC", "-w", *words, *paths]
     subprocess.run([*command, str(folder / "solver.cpp"), "-o", str(folder / "solver.so")], check=True)
     return c.CDLL(str(folder / "solver.so"))
@@ -179,12 +177,11 @@ class Solver:
     blocks: thread blocks of the body
     host: stands for the GPU
     phases: NewtonPhases.of_solves, where a step has several linearizations
-    refreshed: factors are refreshed where the body has changed most, and not corrected
     """
 
     def __init__(
         self, sim: Simulation, monkeypatch: pytest.MonkeyPatch, near: int = 0, blocks: int = 1,
-        host: SolverHost | None = None, phases: Sequence[Any] = (), refreshed: bool = False,
+        host: SolverHost | None = None, phases: Sequence[Any] = (),
     ):  # fmt: skip
         monkeypatch.setattr(gpu_solver, "compiled", lambda name, module, kernel: SimpleNamespace())
         assigned = lambda nodes, processors, most: (assign_blocks(nodes, blocks), blocks)  # noqa: E731
@@ -200,16 +197,11 @@ class Solver:
         own = sim.scene.solver
         budgets = bool(own.budget or own.step_budget)
         sites = int(given.contact.body_start[-1]) // 2 if given.contact else 0
-        self.correction = self.refresh = None
-        if refreshed:
-            self.refresh = LocalRefresh(gpu, given.ranges, given.arrays["row_start"], given.arrays["columns"])
-        else:
-            self.correction = FactorCorrection(gpu, sim.scene.solver.woodbury, list(given.ranges), touch, sites)
+        self.correction = FactorCorrection(gpu, sim.scene.solver.woodbury, list(given.ranges), touch, sites)
         self.counter, contact = as_device(np.zeros(1, np.int64)), given.contact is not None
         self.solver = PcgSolver(
             gpu, given.ranges, given.arrays, self.counter, 4, contact=contact, correction=self.correction,
             errors=given.errors or budgets, phases=phases, budgets=budgets, cut=given.cut,
-            refresh=self.refresh,
         )  # fmt: skip
         rows = self.solver.bodies
         assert rows["blocks"].sum() == blocks
@@ -228,9 +220,7 @@ class Solver:
 
     @property
     def used(self) -> int:
-        """Nodes of the first body that have columns, or on which the last solve was exact."""
-        if self.refresh is not None:
-            return int(self.refresh.bodies.view(REFRESHED_BODY)["used"][0])
+        """Nodes of the first body that have columns."""
         return int(self.correction.bodies.view(CORRECTED_BODY)["used"][0])
 
     def post(self, values: np.ndarray, step: int) -> None:
@@ -264,8 +254,7 @@ class Solver:
         c.memmove(self.solver.bodies_device, self.solver.bodies.ctypes.data, self.solver.bodies.nbytes)
 
     def _run(self, library: c.CDLL) -> None:
-        last: Any = self.refresh or self.correction
-        library.solve(*(c.c_void_p(x.ctypes.data) for x in (self.solver.params, last.params)))
+        library.solve(*(c.c_void_p(x.ctypes.data) for x in (self.solver.params, self.correction.params)))
 
     def solve(self, library: c.CDLL) -> tuple[np.void, np.void]:
         """Makes a step; returns the results of both."""

@@ -170,20 +170,6 @@ def written_back(simulation):
     assert len({array.name for array in arrays}) == len(arrays)
 
 
-def test_factors_of_a_large_body_are_refreshed_and_what_is_known_for_that_is_state(cupy):
-    """Where nothing else corrects them: not where it can be grabbed."""
-    cells = (18, 8, 9)
-    simulation = Simulation(scene(bar(cells, fixed="X < 0.01"), preconditioner="cholesky"), "gpu")
-    assert any("-DREFRESHED" in options for _, options in cupy.compiled)
-    simulation.engine.run(3)
-    written_back(simulation)
-    names = {array.name for array in state_arrays(simulation)}
-    assert names >= {f"engine.refresh.{part}" for part in ("bodies", "blocks_then", "noted")}
-    assert simulation.engine.refreshed(0) == 0
-    for other in (bar((4, 2, 2)), bar(cells, touch={"max_force": 10.0})):
-        assert Simulation(scene(other, preconditioner="cholesky"), "gpu").engine._refresh is None
-
-
 def test_a_scene_is_reset_saved_and_resumed(cupy):
     """State on the device is read and written; with contact and ties: below."""
     simulation = made("held", "gpu", preconditioner="block_jacobi")

@@ -4,9 +4,9 @@
 #pragma once
 #include "block_group.cuh"
 #include "correction_state.cuh"
-#include "pivots3.cuh"
 
 constexpr int MOST_COLUMNS = 3 * MOST_CORRECTED;
+constexpr double LEAST_PIVOT = 1e-14;  // of the determinant of a pivot of I + U'V C
 
 struct CorrectionMemory {        // shared memory of a thread block
     long long step;              // of the factor that V is for
@@ -86,7 +86,7 @@ __device__ __noinline__ void compare_blocks(CorrectionMemory& m, const float* sh
 // Numbers of `scratch` that make_inner needs for so many nodes.
 HOST_DEVICE long long scratch_size(int nodes) { return 9ll * nodes * nodes + 18ll * nodes; }
 
-// M = C (I + S C)^-1 with S = U'V: without exchanges of rows, as I + S C has
+// M = C (I + S C)^-1 with S = U'V, by Gauss-Jordan elimination with pivots of 3x3: without exchanges of rows, as I + S C has
 // eigenvalues from 1 on where something is added, and positive ones as long as the corrected inverse is positive definite. Sets
 // `ordered` if the pivots are. Done by one thread block. columns: V of the body; a: `scratch`.
 __device__ __noinline__ void make_inner(CorrectionMemory& m, const float* share, const double* difference, const float* columns, int width,
@@ -104,10 +104,40 @@ __device__ __noinline__ void make_inner(CorrectionMemory& m, const float* share,
         a[e] = sum;
     }
     __syncthreads();
-    if (!invert_by_pivots(a, n, row, column, LEAST_PIVOT)) {
-        if (me == 0) m.ordered = 0;
+    for (int p = 0; p < n; p += 3) {
+        double d[9], inverse[9];
+        for (int k = 0; k < 9; ++k) d[k] = a[(long long)(p + k / 3) * n + p + k % 3];
+        const double det = d[0] * (d[4] * d[8] - d[5] * d[7]) - d[1] * (d[3] * d[8] - d[5] * d[6]) + d[2] * (d[3] * d[7] - d[4] * d[6]);
+        if (!(det > LEAST_PIVOT && det < 1e300)) {  // in all threads
+            if (me == 0) m.ordered = 0;
+            __syncthreads();
+            return;
+        }
+        for (int i = 0; i < 3; ++i)
+            for (int j = 0; j < 3; ++j) {
+                const int b = (j + 1) % 3, c = (j + 2) % 3, q = (i + 1) % 3, r = (i + 2) % 3;
+                inverse[3 * i + j] = (d[3 * b + q] * d[3 * c + r] - d[3 * b + r] * d[3 * c + q]) / det;
+            }
+        for (int j = me; j < n; j += THREADS)
+            for (int k = 0; k < 3; ++k) {
+                row[k * n + j] = inverse[3 * k] * a[(long long)p * n + j] + inverse[3 * k + 1] * a[(long long)(p + 1) * n + j] +
+                                 inverse[3 * k + 2] * a[(long long)(p + 2) * n + j];
+                column[3 * j + k] = a[(long long)j * n + p + k];
+            }
         __syncthreads();
-        return;
+        for (int e = me; e < n * n; e += THREADS) {
+            const int i = e / n, j = e % n;
+            const bool in_row = i >= p && i < p + 3, in_column = j >= p && j < p + 3;
+            const double* f = column + 3 * i;
+            if (in_row) {
+                a[e] = in_column ? inverse[3 * (i - p) + j - p] : row[(i - p) * n + j];
+            } else if (in_column) {
+                a[e] = -(f[0] * inverse[j - p] + f[1] * inverse[3 + j - p] + f[2] * inverse[6 + j - p]);
+            } else {
+                a[e] -= f[0] * row[j] + f[1] * row[n + j] + f[2] * row[2 * n + j];
+            }
+        }
+        __syncthreads();
     }
     for (int e = me; e < n * width; e += THREADS) {
         const int i = e / width, j = e % width;

@@ -35,7 +35,6 @@ from sim_server.backends.gpu.mailbox import ChangeMailbox, DeviceMailbox
 from sim_server.backends.gpu.measured import MeasuredReport
 from sim_server.backends.gpu.newton import NewtonIteration, NewtonPhases, begins_beside
 from sim_server.backends.gpu.pinned import pinned_array
-from sim_server.backends.gpu.refresh import LocalRefresh
 from sim_server.backends.gpu.rosenbrock import ATTEMPTS, RosenbrockStep
 from sim_server.backends.gpu.solver import PCG_BODY, SETTINGS_BYTES, PcgSolver
 from sim_server.backends.gpu.splits import DeviceSplits, Staged
@@ -125,7 +124,6 @@ class GpuEngine(DeviceLoop):
         self._forces = fuse(forces) if alone else ()  # after a whole assembly, whose energy balance is made already
         phases = NewtonPhases.initial(gpu, bodies) if newton else None
         correction = self._correction = FactorCorrection.wanted(gpu, given)
-        self._refresh = LocalRefresh.wanted(gpu, given)
         most_blocks = given.cut.most_blocks if given.cut else ()
         surfaces = given.contact.surfaces if given.contact else None
         self._rows_of_bodies: tuple[NDArray[Any], ...] = (
@@ -137,7 +135,7 @@ class GpuEngine(DeviceLoop):
             phases.of_solves(errors) if phases else (), ATTEMPTS if stages else 0,
             given.contact is not None,
             given.contact is not None and bool(given.contact.surfaces or given.contact.ties), correction, errors,
-            budgets, given.cut, self._refresh,
+            budgets, given.cut,
         )  # fmt: skip
         self._newton, newton_results = None, None
         if newton and phases:
@@ -283,8 +281,7 @@ class GpuEngine(DeviceLoop):
 
     def state(self) -> list[StateArray]:
         """Returns what the device carries on beside the arrays that launches write."""
-        own = (self._correction, self._refresh)
-        parts = (self._energies, self.stages, self._substeps, self._contact, *own, self._splits)
+        parts = (self._energies, self.stages, self._substeps, self._contact, self._correction, self._splits)
         clock = self.gpu.twin(self._arrays["clock"])
         found = [device_array("engine.clock", clock), *(a for part in parts if part for a in part.state())]
         if self._rows_of_bodies:
@@ -530,11 +527,6 @@ class GpuEngine(DeviceLoop):
     def factor_bytes(self, body: int) -> int:
         """Returns the bytes of the inverse that one application reads."""
         return self.solver.factor_bytes(body)
-
-    def refreshed(self, body: int) -> int:
-        """Number of nodes on which the last solve was exact beside its factor. A probe for tests; only while the loop
-        stands still."""
-        return self._refresh.used(body) if self._refresh else 0
 
     def correct(
         self, body: int, nodes: int, diagonal: Float64, double: bool = False, block: Float64 | None = None

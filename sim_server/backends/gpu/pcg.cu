@@ -26,9 +26,6 @@
 #ifdef CORRECTED
 #include "correction.cuh"
 #endif
-#ifdef REFRESHED
-#include "refresh.cuh"
-#endif
 #ifdef BUDGETS
 #include "step_budget.cuh"
 #endif
@@ -51,9 +48,6 @@ struct BlockMemory {  // static shared memory of a thread block: data that is th
 #endif
 #ifdef CORRECTED
     CorrectionMemory correction;
-#endif
-#ifdef REFRESHED
-    RefreshMemory refresh;
 #endif
 #ifdef ERRORS
     double peaks[WARPS + 1];
@@ -97,10 +91,6 @@ struct PcgSolver {
     const Correction& given_correction;
     bool corrects = false;  // applications are corrected
     int column = -1;        // of V, that the next application makes
-    int body = 0;
-#endif
-#ifdef REFRESHED
-    const Refresh& refresh;
     int body = 0;
 #endif
 #ifdef ERRORS
@@ -205,9 +195,6 @@ struct PcgSolver {
         const double large = first_of_solve ? look_for_differences() : 0;
 #else
         double mine[2] = {0, 0}, out[2];
-#endif
-#ifdef REFRESHED
-        if (first_of_solve) note_blocks();
 #endif
         rows.multiply([&](int node, int c, real qk) {
             const int k = 3 * node + c;
@@ -373,13 +360,6 @@ struct PcgSolver {
         const BlockRows rows = memory.rows;
         if (packed) rows.form(memory.inverse.z, z_number, beta, [&](int k, float z) { return applied(rows, k, z); });
         else rows.form(s.z, z_number, beta, [](int, real z) { return z; });
-#ifdef REFRESHED
-        const RefreshMemory& m = memory.refresh;
-        if (packed && m.used) {  // p takes up what S makes of z
-            for (int k = threadIdx.x; k < 3 * m.pairs; k += THREADS) rows.values[3 * m.entry[k / 3] + k % 3] -= m.s[k];
-            __syncthreads();
-        }
-#endif
 #ifdef ERRORS
         double z2 = largest2([&](int k) { return rows.q[k]; });
         __syncthreads();
@@ -641,153 +621,6 @@ struct PcgSolver {
     }
 #endif
 
-#ifdef REFRESHED
-    // Keeps the own nodes' blocks of this step's matrix.
-    __device__ __forceinline__ void note_blocks() const {
-        const BlockRows& rows = memory.rows;
-        const long long step = s.step[0], slot = step % refresh.kept;
-        if (threadIdx.x == 0) {
-            memory.refresh.used = 0;
-            if (group.index == 0) {
-                __stcg(refresh.noted + slot * s.count + body, step);
-                __stcg(&refresh.bodies[body].used, 0);
-            }
-        }
-        for (int k = THREADS - 1 - threadIdx.x; k < rows.own; k += THREADS) {  // the last warps, which have least to do
-            const int node = memory.body.first + rows.begin + k;
-            const real* own = s.values + 9ll * refresh.own_block[node];
-            float* to = refresh.blocks_then + 6 * (slot * refresh.nodes + node);
-            for (int i = 0; i < 6; ++i) __stcg(to + i, (float)own[entry_of_upper(i)]);
-        }
-    }
-
-    __device__ __forceinline__ bool was_slow() const {
-        return packed && __ldcg(&refresh.bodies[body].slow) == memory.body.factor_step && memory.body.factor_step >= 0;
-    }
-
-    // Finds T, makes S, and writes x + alpha p to the scene, with r = 0 on T; a residual has to follow. False if there is nothing to refresh,
-    // or the factor's matrix is not known: then the solve goes on as it was.
-    __device__ __forceinline__ bool refresh_factor(real alpha) {
-        const long long then = memory.body.factor_step, slot = then % refresh.kept, step = s.step[0];
-        if (then < 0 || then >= step || step - then >= refresh.kept || __ldcg(refresh.noted + slot * s.count + body) != then) return false;
-        RefreshMemory& m = memory.refresh;
-        double* a = refresh.room + (long long)body * REFRESH_ROOM;
-        for (int part = 0; part < 4; ++part) {  // so that the code of the barrier is there once
-            if (part == 0) {
-                compare_blocks_of(slot);
-            } else if (part == 1) {
-                choose_refreshed(m, refresh.score + memory.body.first, memory.body.nodes);
-                if (!m.used) return false;
-                find_pairs(m, memory.rows);
-                write_rows(m, memory.rows, a);
-            } else if (part == 2) {
-                if (group.index == 0) invert_on_changes(a);
-            } else {
-                if (threadIdx.x == 0) m.used = __ldcg(&refresh.bodies[body].used);
-                __syncthreads();
-                if (!m.used) return false;
-                start_refreshed(alpha);
-            }
-            group.barrier();
-        }
-        return true;
-    }
-
-    // Scores of the own nodes.
-    __device__ __forceinline__ void compare_blocks_of(long long slot) const {
-        for (int k = threadIdx.x; k < memory.rows.own; k += THREADS) {
-            const int node = memory.body.first + memory.rows.begin + k;
-            const real* own = s.values + 9ll * refresh.own_block[node];
-            const float* old = refresh.blocks_then + 6 * (slot * refresh.nodes + node);
-            double change = 0, size = 0;
-            for (int i = 0; i < 6; ++i) {
-                const double now = own[entry_of_upper(i)];
-                change += fabs(now - (double)__ldcg(old + i));
-                size += fabs(now);
-            }
-            __stcg(refresh.score + node, (float)(change / size));
-        }
-    }
-
-    // The first thread block takes the memory of its part of the inverse, if that is large enough.
-    __device__ __forceinline__ void invert_on_changes(double* a) {
-        const int n = 3 * memory.refresh.used;
-        const bool fits = 8ll * n * (n + 6) <= 512ll * memory.inverse.near;
-        copies_end<0>();
-        __syncthreads();
-        if (fits) fetched = arrived = false;
-        const bool made = make_local_inverse(n, a, fits ? (double*)memory.inverse.kept : nullptr, local_inverse());
-        if (threadIdx.x == 0) __stcg(&refresh.bodies[body].used, made ? memory.refresh.used : 0);
-    }
-
-    __device__ __forceinline__ float* local_inverse() const { return refresh.inner + (long long)body * REFRESHED_FREEDOMS * REFRESHED_FREEDOMS; }
-    __device__ __forceinline__ FlagWord<float>* local_words() const { return refresh.t + (long long)body * REFRESHED_FREEDOMS; }
-
-    // s = S t at the nodes of the halo in T, t with the words of this exchange.
-    __device__ __forceinline__ void solve_on_changes() const {
-        RefreshMemory& m = memory.refresh;
-        for (int k = threadIdx.x; k < 3 * m.used; k += THREADS) {
-            const FlagWord<float>* word = local_words() + k;
-            float value;
-            for (unsigned spins = 0; keep_polling(!word->get(value, group.number), spins);) {}
-            m.t[k] = value;
-        }
-        __syncthreads();
-        apply_local_inverse(m, local_inverse());
-    }
-
-    // x + alpha p + S r, r the residual there.
-    __device__ __forceinline__ void start_refreshed(real alpha) const {
-        const RefreshMemory& m = memory.refresh;
-        const BlockRows& rows = memory.rows;
-        real* y = s.y + 3ll * (memory.body.first + rows.begin);
-        for (int k = threadIdx.x; k < 3 * rows.own; k += THREADS) __stcg(y + k, rows.x[k] + alpha * rows.values[k]);
-        for (int k = threadIdx.x; k < 3 * m.pairs; k += THREADS) {
-            const int own = 3 * m.entry[k / 3] + k % 3;
-            if (own < 3 * rows.own) local_words()[3 * m.slot[k / 3] + k % 3].put((float)(rows.r[own] - alpha * rows.q[own]), group.number);
-        }
-        solve_on_changes();
-        for (int k = threadIdx.x; k < 3 * m.pairs; k += THREADS) {
-            const int own = 3 * m.entry[k / 3] + k % 3;
-            if (own < 3 * rows.own) __stcg(y + own, rows.x[own] + alpha * rows.values[own] + (real)m.s[k]);
-        }
-    }
-
-    // After an application: s = S (A z - r) on T, which `direction` takes off z. Of z . r it would take s . r off, which is rounding error.
-    __device__ __forceinline__ void refresh_application() {
-        const RefreshMemory& m = memory.refresh;
-        const BlockRows& rows = memory.rows;
-        const int lane = threadIdx.x % 32;
-        for (int p = threadIdx.x / 32; p < m.pairs; p += WARPS) {
-            const int own = m.entry[p];
-            if (own >= rows.own) continue;
-            double sum[3] = {0, 0, 0};
-            for (int k = rows.row_start[own] - rows.base + lane; k < rows.row_start[own + 1] - rows.base; k += 32) {
-                const FlagWord<float>* z = memory.inverse.z + rows.position(rows.columns[k]);
-                const real* a = rows.blocks + 9ll * k;
-                for (int j = 0; j < 3; ++j) {
-                    float v;
-                    for (unsigned spins = 0; keep_polling(!z[j].get(v, z_number), spins);) {}
-                    for (int i = 0; i < 3; ++i) sum[i] += (double)a[3 * i + j] * (double)v;
-                }
-            }
-            __syncwarp();
-            for (int i = 0; i < 3; ++i) {
-                for (int k = 16; k; k >>= 1) sum[i] += __shfl_xor_sync(ALL, sum[i], k);
-                if (lane == 0) local_words()[3 * m.slot[p] + i].put((float)(sum[i] - (double)rows.r[3 * own + i]), group.number);
-            }
-        }
-        solve_on_changes();
-    }
-
-    // Keeps what later solves and tests are told.
-    __device__ __forceinline__ void keep_refresh(bool slow) const {
-        RefreshedBody& to = refresh.bodies[body];
-        to.used = memory.refresh.used;
-        if (slow) to.slow = memory.body.factor_step;
-    }
-#endif
-
     __device__ __forceinline__ void invert_diagonal(bool whole) const {
         const BlockRows& rows = memory.rows;
         for (int node = threadIdx.x; node < rows.own; node += THREADS) {
@@ -856,10 +689,6 @@ __device__ __forceinline__ void PcgSolver::solve() {
 #ifdef CORRECTED
     bool prepares = false;
     int made = 0;  // columns of V
-#endif
-#ifdef REFRESHED
-    bool due = kind == CHOLESKY && was_slow(), slow = false;  // the factor is to be refreshed now; this solve was slow without
-    double first_r2 = 0;
 #endif
     if (kind == JACOBI || kind == BLOCK_JACOBI) invert_diagonal(kind == BLOCK_JACOBI);
     for (;;) {
@@ -936,18 +765,6 @@ __device__ __forceinline__ void PcgSolver::solve() {
             }
             if (fresh) turn = 1 - turn;
         }
-#ifdef REFRESHED
-        if (iterations == 0 && !slow) first_r2 = r2;
-        if (due) {
-            due = false;
-            if (refresh_factor((real)alpha)) {
-                if (group.index == 0 && threadIdx.x == 0) keep_refresh(slow);
-                stop = CONVERGED;
-                measure = true;
-                continue;
-            }
-        }
-#endif
         stop = r2 <= memory.goal ? CONVERGED : -1;
 #ifdef ERRORS
         if (enough) stop = CONVERGED;
@@ -972,9 +789,6 @@ __device__ __forceinline__ void PcgSolver::solve() {
             }
 #else
             const double zr = precondition(kind, (real)alpha, r2);
-#endif
-#ifdef REFRESHED
-            if (kind == CHOLESKY && memory.refresh.used && usable(zr)) refresh_application();
 #endif
             alpha = 0;
             int other = -1;
@@ -1020,10 +834,6 @@ __device__ __forceinline__ void PcgSolver::solve() {
 #ifdef ERRORS
                     if (usable(alpha) && isfinite(r2)) look_ahead((real)alpha, r2);
 #endif
-#ifdef REFRESHED
-                    if (kind == CHOLESKY && iterations == REFRESH_AFTER && !memory.refresh.used && r2 > memory.goal)
-                        due = slow = !(power<REFRESH_AFTER>(r2 / memory.goal) < power<REFRESH_WORTH>(first_r2 / r2));
-#endif
                     if (usable(alpha) && isfinite(r2)) continue;
                     alpha = 0;
                 }
@@ -1056,10 +866,6 @@ __device__ __forceinline__ void PcgSolver::solve() {
 #define CORRECTION , const Correction correction
 #define CORRECTION_PARAMETER , const Correction& correction
 #define CORRECTED_BY , correction
-#elif defined(REFRESHED)  // factors are refreshed where A has changed most (refresh_state.cuh)
-#define CORRECTION , const Refresh refresh
-#define CORRECTION_PARAMETER , const Refresh& refresh
-#define CORRECTED_BY , refresh
 #else
 #define CORRECTION
 #define CORRECTION_PARAMETER
@@ -1152,14 +958,12 @@ __device__ __forceinline__ void solve_body(const PcgArguments& s, const RowRange
                         , correction
 #elif defined(CORRECTED)
                         , 0, 0, 0, 0, false, false, false, false, false, correction
-#elif defined(REFRESHED)
-                        , 0, 0, 0, 0, false, false, false, false, false, refresh
 #endif
     };
 #ifdef STAGES
     solver.given = stage.form == ITERATE;
 #endif
-#if defined(CORRECTED) || defined(REFRESHED)
+#ifdef CORRECTED
     solver.body = k;
 #endif
     solver.set_up(range);

@@ -21,9 +21,8 @@ from sim_server.backends.gpu.followed_rows import FollowedRows
 from sim_server.backends.gpu.inverse.build_inverse import InverseBuilder, PartitionedInverse, builder_kernels
 from sim_server.backends.gpu.inverse.device_plan import DevicePlan, shared_bytes
 from sim_server.backends.gpu.inverse.plan import plan
-from sim_server.backends.gpu.refresh import LocalRefresh
 from sim_server.backends.gpu.row_partition import SPARED, best_assignment, halo, initial_ranges, lists_of
-from sim_server.backends.gpu.structs import CONTACT, CORRECTION, PCG, PCG_RESULT, REFRESH, STAGES
+from sim_server.backends.gpu.structs import CONTACT, CORRECTION, PCG, PCG_RESULT, STAGES
 
 T = TypeVar("T")
 
@@ -63,7 +62,6 @@ class PcgSolver:
     errors: True for a scene whose solves estimate the errors of positions (iterate_error.cuh)
     budgets: True for a scene whose solves may end by their wall time (step_budget.cuh); they estimate errors, too
     cut: what tells of nodes that lose elements, and how many blocks A has at most; None: no body can be cut
-    refresh: of factors where a body has changed most; None: they are not refreshed
 
     followed: what follows the pattern of A then (`follow`), else None
     params: arguments of the kernel (PCG_ARGUMENTS)
@@ -78,12 +76,12 @@ class PcgSolver:
         self, gpu: Gpu, ranges: Sequence[tuple[int, int]], arrays: Mapping[str, NDArray[Any]], counter: DeviceArray,
         capacity: int, planes: int = 1, phases: Sequence[DeviceArray] = (), attempts: int = 0, contact: bool = False,
         between: bool = False, correction: FactorCorrection | None = None, errors: bool = False, budgets: bool = False,
-        cut: CutInput | None = None, refresh: LocalRefresh | None = None,
+        cut: CutInput | None = None,
     ):  # fmt: skip
         cp, processors = gpu.cp, gpu.properties["multiProcessorCount"]
         self.gpu, self.counter, self._capacity, self.planes, self._phases = gpu, counter, capacity, planes, phases
         self._attempts, self._contact, self._correction, self.errors = attempts, contact, correction, errors
-        self.budgets, self._cut, self._refresh = budgets, cut, refresh
+        self.budgets, self._cut = budgets, cut
         most_blocks = cut.most_blocks if cut else ()
         self._twins = {name: gpu.twin(arrays[name]) for name in ("row_start", "values", "b", "y", "moving")}
         self.real = np.dtype(self._twins["values"].dtype)
@@ -128,7 +126,7 @@ class PcgSolver:
             assert self._work["at_rest"].dtype == self.real
         if self.followed:
             self._work["split_step"] = cp.zeros(len(ranges), np.int64)
-        fixed = 5120 if correction else 4096 if refresh else 2048  # bytes: what pcg.cu declares, and the driver's
+        fixed = 5120 if correction else 2048  # bytes: shared memory that pcg.cu declares, and the driver's
         self._shared = (gpu.properties["sharedMemPerMultiprocessor"] // blocks - fixed - 1024) // 16 * 16
         self.params = self._arguments(total, assigned.pooled)
         self._function = self._compiled("pcg", blocks)
@@ -179,16 +177,13 @@ class PcgSolver:
         declared = STAGES if self._attempts else CONTACT if self._contact else PCG
         numbers = {"THREADS": self.threads, "PER_PROCESSOR": blocks}
         text, corrected = (SOURCES / f"backends/gpu/{name}.cu").read_text(), name == "pcg" and self._correction
-        refreshed = name == "pcg" and self._refresh
         module = self.gpu.cp.RawModule(
-            code=text + declared.assertions() + (CORRECTION.assertions() if corrected else "")
-            + (REFRESH.assertions() if refreshed else ""),
+            code=text + declared.assertions() + (CORRECTION.assertions() if corrected else ""),
             options=(
                 *options(self._types), *own_headers(),
                 *(f"-D{name}={number}" for name, number in numbers.items()),
                 *(["-DNEWTON_PHASES"] if self._phases else []), *(["-DSTAGES"] if self._attempts else []),
                 *(["-DCONTACT_PASSES"] if self._contact else []), *(["-DCORRECTED"] if corrected else []),
-                *(["-DREFRESHED"] if refreshed else []),
                 *(["-DERRORS"] if self.errors and name == "pcg" else []),
                 *(["-DBUDGETS"] if self.budgets and name == "pcg" else []),
                 *(["-DCUTS"] if self._cut and name == "pcg" else []),
@@ -214,7 +209,7 @@ class PcgSolver:
     @property
     def _corrected(self) -> tuple[NDArray[Any], ...]:
         """The last argument of pcg.cu, if there is one."""
-        return tuple(part.params for part in (self._correction, self._refresh) if part)
+        return (self._correction.params,) if self._correction else ()
 
     def solve_contact(self, b: DeviceArray, contact: NDArray[Any]) -> None:
         """Launches a solve of a step with contact (contact_state.cuh).
