@@ -10,6 +10,7 @@ import zenoh
 from protocol.channels import PART_BYTES, WHOLE_PARTS, key
 from protocol.counters import Counters
 from protocol.method import Method
+from protocol.shared_memory.limits import SLOT_SHARE
 from protocol.shared_memory.pool import Slot, SlotPool
 from sim_server.network.batch_message import MOST_TOGETHER, Entry, batch_message, entries_of, group
 from sim_server.network.bookkeeping import Bookkeeping
@@ -22,7 +23,6 @@ from sim_server.updates.factor_source import Job
 FAST_SEND = 0.05  # s in which a fast link takes a job as bytes; zenoh drops what is not taken within 0.25 s
 BEHIND = 10.0  # s of a lease, at most, for what waits at a worker behind a first job, which has a longer one
 MAX_SENT = 4096  # times of jobs that are remembered
-SLOT_SHARE = 4  # a larger part of all shared memory than a SLOT_SHARE-th is not lent for one factor: it goes in parts
 SLOT_MARGIN = 8  # the slot for an incomplete factor is larger than the largest factor so far by a SLOT_MARGIN-th
 
 

@@ -48,9 +48,14 @@ class Maker:
         self.limits: list[int | None] = []  # multiprocessors of each build
         self.fail: Exception | None = None
         self.thread = ThreadPoolExecutor(1)
+        self.fine: set[int] = set()  # values whose inverses need 22 binary digits
+        self.planes_used: list[int] = []
         self.planning: list[Future] | None = None  # plans that are not made yet; None: each is made at once
 
-    def begin_plan(self, body: int, pattern: SimpleNamespace) -> Future:
+    def planes_for(self, pattern: SimpleNamespace, values: np.ndarray) -> int:
+        return 2 if values[0] in self.fine else 1
+
+    def begin_plan(self, body: int, pattern: SimpleNamespace, planes: int) -> Future:
         made: Future = Future()
         if isinstance(self.fail, ValueError):
             made.set_exception(self.fail)
@@ -67,7 +72,7 @@ class Maker:
         self.storages.append([])
         return self.storages[-1]
 
-    spared = 8
+    spared, planes = 8, None
 
     def build(self, values: np.ndarray, storage: list[int], multiprocessors: int | None = None) -> PartitionedInverse:
         if self.fail:
@@ -81,11 +86,14 @@ class Maker:
         """In place of a factor the number that it is."""
         return r / inverse.storage[0]
 
-    def forget_plans(self, patterns: set[int]) -> None:
-        self.known = patterns
+    def forget_plans(self, kept: set[tuple[int, int]]) -> None:
+        self.known = kept
 
-    def use(self, body: int, pattern: SimpleNamespace, inverse: PartitionedInverse, step: int) -> None:
+    def use(
+        self, body: int, pattern: SimpleNamespace, inverse: PartitionedInverse, planes: int, step: int
+    ) -> None:  # fmt: skip
         self.bodies["factor"] = inverse.storage[0]
+        self.planes_used.append(planes)
 
 
 PATTERN = SimpleNamespace(id=1)
@@ -336,7 +344,53 @@ def test_plans_are_kept_of_the_last_two_patterns_alone(parts):
         upload.post(0, SimpleNamespace(id=number), np.array([number]), 0)
         upload.settle()
         scene.loop.run(1)
-        assert maker.known == {*range(max(1, number - 1), number + 1)}
+        assert maker.known == {(n, 1) for n in range(max(1, number - 1), number + 1)}
+
+
+def test_each_inverse_has_as_many_digits_as_its_factor_needs(parts, caplog):
+    """Two storages of each kind are reused; what changes is logged."""
+    scene, maker, upload = parts
+    maker.fine = {7, 8, 11}
+    with caplog.at_level(logging.INFO):
+        for value in range(5, 12):
+            post(upload, value)
+            upload.settle()
+            scene.loop.run(1)
+    assert maker.planes_used == [1, 1, 2, 2, 1, 1, 2]
+    assert used(scene) == list(range(5, 12))
+    assert len(maker.storages) == 4 and maker.known == {(PATTERN.id, 1), (PATTERN.id, 2)}
+    assert [
+        f"{digits} binary digits" in each.message for each, digits in zip(caplog.records, (22, 11, 22), strict=True)
+    ]
+
+
+@pytest.mark.parametrize("waits", [False, True])
+@pytest.mark.parametrize("prepare", [False, True])
+def test_a_large_factor_is_looked_at_and_built_beside_the_caller(parts, monkeypatch, prepare, waits):
+    """Where its plan is not made yet it is built behind that. prepare: before it is posted"""
+    scene, maker, upload = parts
+    monkeypatch.setattr(module, "SMALL", 0)
+    maker.fine, threads = {5}, []
+    choose = maker.planes_for
+
+    def seen(*arguments: Any) -> int:
+        threads.append(threading.current_thread())
+        return choose(*arguments)
+
+    def queued(body: int, pattern: SimpleNamespace, planes: int) -> Future:
+        return maker.thread.submit(lambda: SimpleNamespace(builder=maker))
+
+    maker.planes_for = seen
+    if waits:
+        maker.begin_plan = queued
+    values = np.array([5])
+    if prepare:
+        np.testing.assert_array_equal(upload.prepare(0, PATTERN, values, 5, R).result(30), R / 5)
+    upload.post(0, PATTERN, values, 5)
+    upload.settle()
+    scene.loop.run(1)
+    assert used(scene) == [5] and maker.planes_used == [2] and len(maker.events) == 1
+    assert threads and threading.current_thread() not in threads
 
 
 def test_settled_means_used_by_the_next_step_even_if_others_wait(parts):

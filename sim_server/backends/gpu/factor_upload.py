@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: MIT
 """Upload of factors: a partitioned inverse is built beside the steps, then posted into the mailbox of the body.
 
-Each body has two storages per pattern (double buffering). A build begins once the inverse before it is in use and no
-step under way reads the other storage. A factor that arrives earlier is queued; a newer one replaces it. Plans, made
-once per pattern, and the copies of large factors, or of many, are left to a thread (PcgSolver.beside), for which the
-thread that serves the loop does not wait.
+Each body has two storages per pattern and number of binary digits (double buffering). A build begins once the inverse
+before it is in use and no step under way reads the other storage. A factor that arrives earlier is queued; a newer one
+replaces it. Plans, made once per pattern, and the copies of large factors, or of many, are left to a thread
+(PcgSolver.beside), for which the thread that serves the loop does not wait.
 
 A factor may be *prepared* while it is checked: its inverse is built, applied once for the check, and kept out of use
 until the factor is posted, or dropped.
@@ -12,12 +12,12 @@ until the factor is posted, or dropped.
 
 import logging
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, InvalidStateError, wait
 from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 from numpy.typing import NDArray
 
@@ -36,16 +36,32 @@ log = logging.getLogger(__name__)
 SMALL = 1 << 20  # bytes of a factor that is copied at once
 MANY = 4  # small factors that come together, from which on none is built at once
 BUSY = 0.25  # share of dt that steps in real time take, up to which builds may have the whole device
-MAX_PATTERNS = 2  # of a body at a time; workers with different libraries send different patterns
+MAX_KINDS = 2  # of inverses of a body at a time; workers with different libraries send different patterns
+InverseKind = tuple[int, int]
+"""Of inverses: id of the pattern, float16 numbers per entry."""
 
 
 class UploadedFactor(NamedTuple):
-    """A factor on the device, complete once the event of its inverse is. step: of the matrix it was made from."""
+    """A factor on the device, complete once the event of its inverse is.
+
+    step: of the matrix it was made from
+    planes: float16 numbers per entry
+    """
 
     inverse: PartitionedInverse
     storage: InverseStorage
     step: int
     pattern: FactorPattern
+    planes: int
+
+    @property
+    def kind(self) -> InverseKind:
+        """Of its inverse."""
+        return self.pattern.id, self.planes
+
+
+Build = Future[UploadedFactor] | Future[UploadedFactor | Future[UploadedFactor]]
+"""In the thread of the plans; it may end with one behind it."""
 
 
 @dataclass(eq=False)
@@ -81,7 +97,8 @@ class GivenFactor:
 class BodyUploads:
     """Factors of one body.
 
-    storages: by id of the pattern
+    planes: float16 numbers per entry of the last factor's inverse, or of the first one's as expected
+    storages: by kind
     leaving: the factor in use before, and the number of steps after whose completion no step reads it
     posted: not taken by the loop yet
     building: in the thread of the plans, and the factor that it is of
@@ -92,11 +109,12 @@ class BodyUploads:
 
     name: str
     mailbox: DeviceMailbox
-    storages: dict[int, list[InverseStorage]] = field(default_factory=dict)
+    planes: int
+    storages: dict[InverseKind, list[InverseStorage]] = field(default_factory=dict)
     in_use: UploadedFactor | None = None
     leaving: tuple[UploadedFactor, int] | None = None
     posted: UploadedFactor | None = None
-    building: tuple[Future[UploadedFactor], GivenFactor] | None = None
+    building: tuple[Build, GivenFactor] | None = None
     built: tuple[UploadedFactor, GivenFactor] | None = None
     queued: GivenFactor | None = None
     warned: bool = False
@@ -107,10 +125,10 @@ class BodyUploads:
         return self.posted is None and self.leaving is None and self.building is None and self.built is None
 
     @property
-    def patterns(self) -> set[int]:
-        """Ids of the patterns whose plans are needed."""
+    def kinds(self) -> set[InverseKind]:
+        """Kinds of inverses whose plans are needed, or may be."""
         coming = [given for given in (self.queued, self.building and self.building[1]) if given]
-        return {*self.storages, *(given.pattern.id for given in coming)}
+        return {*self.storages, *((given.pattern.id, planes) for given in coming for planes in (1, 2))}
 
 
 class FactorUpload:
@@ -125,13 +143,14 @@ class FactorUpload:
         self, gpu: Gpu, solver: PcgSolver, loop: DeviceLoop, names: Sequence[str], mailboxes: Sequence[DeviceMailbox]
     ):
         self._gpu, self._solver, self._loop = gpu, solver, loop
-        self._uploads = [BodyUploads(name, box) for name, box in zip(names, mailboxes, strict=True)]
+        planes = solver.planes or 1
+        self._uploads = [BodyUploads(name, box, planes) for name, box in zip(names, mailboxes, strict=True)]
         self._lock = threading.RLock()
         self._waiting: set[int] = set()  # bodies with a queued factor, or one that is built
 
     def expect(self, body: int, pattern: FactorPattern) -> None:
         """Begins to plan the inverses of factors of a pattern, beside the caller."""
-        self._solver.begin_plan(body, pattern)
+        self._solver.begin_plan(body, pattern, self._uploads[body].planes)
 
     def post(self, body: int, pattern: FactorPattern, values: NDArray[Any], step: int) -> None:
         """Takes a factor: begins to build its inverse now, or once a storage is free.
@@ -223,7 +242,7 @@ class FactorUpload:
             while (building := self._settled(body)) is not None:
                 wait([building])  # without the lock: the thread that serves the loop goes on
 
-    def _settled(self, body: int) -> "Future[UploadedFactor] | None":
+    def _settled(self, body: int) -> Future[Any] | None:
         """Has the next step use the newest factor of a body; returns a build that must be waited for first."""
         with self._lock:
             uploads = self._uploads[body]
@@ -252,9 +271,13 @@ class FactorUpload:
     def _refresh(self, body: int) -> None:
         """Updates the state of the factors: built, taken by the loop, out of use."""
         uploads = self._uploads[body]
-        if uploads.building is not None and uploads.building[0].done():
+        while uploads.building is not None and uploads.building[0].done():
             (future, given), uploads.building = uploads.building, None
-            self._finish(body, given, future.result)
+            made = None if future.exception() else future.result()
+            if isinstance(made, Future):
+                uploads.building = made, given
+            else:
+                self._finish(body, given, cast(Future[UploadedFactor], future).result)
         if uploads.posted is not None and uploads.mailbox.taken:
             if uploads.in_use is not None:  # steps launched until now may still read it
                 uploads.leaving = (uploads.in_use, int(self._loop.loop.launched))
@@ -276,17 +299,34 @@ class FactorUpload:
     def _begin(self, body: int, given: GivenFactor, beside: bool) -> None:
         """Builds an inverse: at once if it is small, planned and not `beside`, else in the thread of the plans."""
         uploads = self._uploads[body]
-        plan = self._solver.begin_plan(body, given.pattern)
         used = uploads.in_use.storage if uploads.in_use else None
-        spare = next((s for s in uploads.storages.get(given.pattern.id, []) if s is not used), None)
-        build = partial(self._build, plan, given, spare)
-        if plan.done() and given.values.nbytes <= SMALL and not beside:
+        spare = {kind: next((s for s in made if s is not used), None) for kind, made in uploads.storages.items()}
+        if given.values.nbytes > SMALL or beside:
+            uploads.building = self._solver.beside(partial(self._choose_and_build, body, given, spare)), given
+            return
+        build, planned = self._chosen(body, given, spare)
+        if planned.done():
             self._finish(body, given, build)
         else:
             uploads.building = self._solver.beside(build), given
 
+    def _choose_and_build(
+        self, body: int, given: GivenFactor, spare: Mapping[InverseKind, InverseStorage | None]
+    ) -> UploadedFactor | Future[UploadedFactor]:
+        """Begins to build an inverse, in the thread of the plans: now, or behind its plan."""
+        build, planned = self._chosen(body, given, spare)
+        return build() if planned.done() else self._solver.beside(build)
+
+    def _chosen(
+        self, body: int, given: GivenFactor, spare: Mapping[InverseKind, InverseStorage | None]
+    ) -> tuple[Callable[[], UploadedFactor], Future[PlannedInverse]]:
+        """Returns what builds an inverse, with as many digits as it needs, once its plan is made, and that plan."""
+        planes = self._solver.planes_for(given.pattern, given.values)
+        plan = self._solver.begin_plan(body, given.pattern, planes)
+        return partial(self._build, plan, given, planes, spare.get((given.pattern.id, planes))), plan
+
     def _build(
-        self, plan: Future[PlannedInverse], given: GivenFactor, spare: InverseStorage | None
+        self, plan: Future[PlannedInverse], given: GivenFactor, planes: int, spare: InverseStorage | None
     ) -> UploadedFactor:  # fmt: skip
         """Begins to build an inverse in a storage, a new one unless there is one to spare. The plan is made."""
         try:
@@ -298,7 +338,7 @@ class FactorUpload:
                 given.tell(builder.apply(inverse, given.r, multiprocessors))
         finally:
             given.tell(None)
-        return UploadedFactor(inverse, storage, given.step, given.pattern)
+        return UploadedFactor(inverse, storage, given.step, given.pattern, planes)
 
     @property
     def _multiprocessors(self) -> int | None:
@@ -318,7 +358,7 @@ class FactorUpload:
             if not given.wanted:
                 uploads.built = None if given.dropped else (factor, given)
                 return
-            self._solver.use(body, given.pattern, factor.inverse, factor.step)
+            self._solver.use(body, given.pattern, factor.inverse, factor.planes, factor.step)
         except (ValueError, CompileError) as error:
             self._warn(uploads, str(error))
             return
@@ -327,23 +367,30 @@ class FactorUpload:
                 raise
             self._warn(uploads, f"not enough GPU memory: {error}")
             return
+        self._tell(uploads, factor.planes)
         uploads.posted = factor
         row = self._solver.bodies[body : body + 1].tobytes()[SETTINGS_BYTES:]
         self._gpu.cp.cuda.get_current_stream().synchronize()  # arrays that `use` may have made are complete
         uploads.mailbox.post(row, keep=factor, event=factor.inverse.event.ptr)
 
     def _keep(self, uploads: BodyUploads, factor: UploadedFactor) -> None:
-        """Keeps the storage of a factor, and forgets those of patterns that are not used any more."""
-        if factor.pattern.id not in uploads.storages:
-            in_use = uploads.in_use.pattern.id if uploads.in_use else None
+        """Keeps the storage of a factor, and forgets those of kinds that are not used any more."""
+        if factor.kind not in uploads.storages:
+            in_use = uploads.in_use.kind if uploads.in_use else None
             for old in [k for k in uploads.storages if k != in_use]:
-                if len(uploads.storages) >= MAX_PATTERNS:
+                if len(uploads.storages) >= MAX_KINDS:
                     del uploads.storages[old]
-            kept = {each for other in self._uploads for each in other.patterns}
-            self._solver.forget_plans({*kept, factor.pattern.id})
-        storages = uploads.storages.setdefault(factor.pattern.id, [])
+            kept = {each for other in self._uploads for each in other.kinds}
+            self._solver.forget_plans({*kept, factor.kind})
+        storages = uploads.storages.setdefault(factor.kind, [])
         if all(storage is not factor.storage for storage in storages):
             storages.append(factor.storage)
+
+    def _tell(self, uploads: BodyUploads, planes: int) -> None:
+        """Takes note of how many digits the inverse of a factor has, and logs it where that changes."""
+        if planes != uploads.planes:
+            uploads.planes = planes
+            log.info("object %r: its factors keep %d binary digits on the GPU from now on", uploads.name, 11 * planes)
 
     def _warn(self, uploads: BodyUploads, reason: str) -> None:
         if not uploads.warned:
