@@ -30,7 +30,7 @@ from sim_server.backends.gpu.factor_upload import FactorUpload
 from sim_server.backends.gpu.held import HeldForces, leading
 from sim_server.backends.gpu.kernel_fusion import DOMAINS, Epilogue, FusedKernel, Prologue, fuse
 from sim_server.backends.gpu.known_patterns import KnownPatterns
-from sim_server.backends.gpu.loop import CAPACITY, MANY, DeviceLoop
+from sim_server.backends.gpu.loop import CAPACITY, GRAPH_STEPS, DeviceLoop
 from sim_server.backends.gpu.mailbox import ChangeMailbox, DeviceMailbox
 from sim_server.backends.gpu.measured import MeasuredReport
 from sim_server.backends.gpu.newton import NewtonIteration, NewtonPhases, begins_beside
@@ -57,7 +57,7 @@ MOST_GRABS = 1024  # pushes and grabs at a time, of which forces are told
 MOST_TOLD = 16  # other bodies whose forces on a body are told, at most
 GRAB_BLOCKS, GRAB_THREADS = 32, 128  # of the kernel react (effects/touch.cu)
 PREPARED_WITHIN = 1.0  # s in which an inverse that is prepared for a check is begun, else the check goes without
-FEW = 16  # largest number of trials in a step without loops for which MANY steps are captured in one graph
+FEW = 16  # largest number of trials in a step without loops for which several steps are captured in one graph
 EPILOGUE = Declarations("backends/gpu/step_epilogue.cu")
 STEP_EPILOGUE = EPILOGUE.dtype("StepEpilogue")
 
@@ -101,8 +101,9 @@ class GpuEngine(DeviceLoop):
             substep_forces, assemble = assemble, []
         ranges, arrays, dt, newton = given.ranges, given.arrays, given.dt, given.newton
         stages, precision = given.stages, given.solver.factor_precision
-        fine = precision == "float32" or (precision == "auto" and stages is not None and stages.factor_alone)
-        planes = 2 if fine else 1  # float16 numbers per entry of an inverse
+        if precision == "auto" and stages is not None and stages.factor_alone:
+            precision = "float32"
+        planes = {"float16": 1, "float32": 2}.get(precision)  # float16 numbers per entry of an inverse
         budgets = bool(given.solver.budget or given.solver.step_budget)
         errors = given.errors or budgets
         self.gpu, self._arrays = gpu, arrays
@@ -313,7 +314,7 @@ class GpuEngine(DeviceLoop):
         """Captures the graphs of the steps, of the energies and of the records."""
         many = self._newton is None or self._newton.loops or self._newton.rounds <= FEW
         for begin in (False, True):
-            for steps in (1, MANY):
+            for steps in GRAPH_STEPS:
                 if steps > 1 and not many:
                     self._graphs.append(None)
                     continue
