@@ -11,7 +11,7 @@ from google.protobuf.message import DecodeError, Message
 from numpy.typing import DTypeLike, NDArray
 
 from protocol.channels import PROTOCOL, check_name
-from protocol.messages_pb2 import Header
+from protocol.messages_pb2 import Header, Topology
 from protocol.printable import make_printable
 from protocol.refused import Refused
 
@@ -139,6 +139,11 @@ def check_numbers(message: Message) -> None:
         elif field.message_type is not None:  # repeated
             for each in value:
                 check_numbers(each)
+
+
+def topology_checksum(topology: Topology) -> int:
+    """Returns xxh3_64 of the pattern of the matrix of an object: Topology.row_start and columns."""
+    return checksum(topology.row_start + topology.columns)
 
 
 def checksum(values: NDArray[Any] | bytes) -> int:
