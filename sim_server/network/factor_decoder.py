@@ -4,6 +4,7 @@
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from weakref import WeakValueDictionary
 
 import numpy as np
 
@@ -13,14 +14,40 @@ from protocol.messages_pb2 import Factor as FactorMessage
 from protocol.messages_pb2 import FactorBatch, Topology
 from protocol.messages_pb2 import FactorPattern as PatternMessage
 from protocol.messages_pb2 import Slot as SlotMessage
+from protocol.method import Method
 from protocol.refused import Refused
-from protocol.validate import Sized, array, check_header, check_numbers, check_strings, copied, parse, take
+from protocol.validate import (
+    Sized,
+    array,
+    check_header,
+    check_numbers,
+    check_strings,
+    copied,
+    parse,
+    take,
+    topology_checksum,
+)
 from sim_server.arrays import Float32, Float64
 from sim_server.network.leases import InFlightJob
 from sim_server.updates.factor_source import FactorMemory
 
+COMPLETE = Method().name
 LARGE = 1 << 20  # bytes of a factor for which `memory` is asked
 MAX_PATTERNS = 4  # kept per object: one for each library among its workers
+
+
+@dataclass
+class CompleteFactors:
+    """What objects whose matrices have one pattern share.
+
+    patterns: of their complete factors, by id
+    largest: values of the largest of these; 0: there was none
+    objects: their names
+    """
+
+    patterns: dict[int, FactorPattern] = field(default_factory=dict)
+    largest: int = 0
+    objects: set[str] = field(default_factory=set)
 
 
 @dataclass
@@ -29,6 +56,8 @@ class AnnouncedObject:
 
     size: degrees of freedom
     blocks: 3x3 blocks of its matrix
+    topology: checksum of the pattern of its matrix
+    complete: shared with objects of this topology
     patterns: of L, by id
     largest: number of values of the largest factor so far, by method
     """
@@ -36,8 +65,23 @@ class AnnouncedObject:
     epoch: int
     size: int
     blocks: int
+    topology: int = 0
+    complete: CompleteFactors = field(default_factory=CompleteFactors)
     patterns: dict[int, FactorPattern] = field(default_factory=dict)
     largest: dict[str, int] = field(default_factory=dict)
+
+    def pattern(self, id: int) -> FactorPattern | None:
+        """Returns a pattern that a worker has sent for this object, or that a factor of one like it had."""
+        return self.patterns.get(id) or self.complete.patterns.get(id)
+
+    @property
+    def known_patterns(self) -> list[int]:
+        """Ids of these patterns."""
+        return list(dict.fromkeys((*self.patterns, *self.complete.patterns)))
+
+    def most_values(self, method: str) -> int:
+        """Number of values of the largest factor by a method so far, also of objects like it; 0: there was none."""
+        return max(self.largest.get(method, 0), self.complete.largest if method == COMPLETE else 0)
 
 
 class FactorDecoder:
@@ -51,7 +95,8 @@ class FactorDecoder:
         self.memory: FactorMemory = np.empty
         self.objects: dict[str, AnnouncedObject] = {}
         self._most_blocks = 0
-        self._unsized: set[str] = set()  # objects that have had no factor in this epoch
+        self._unsized: set[str] = set()  # objects that have had no factor in this epoch, nor has one like them
+        self._complete: WeakValueDictionary[int, CompleteFactors] = WeakValueDictionary()  # by topology
 
     @property
     def most_blocks(self) -> int:
@@ -66,8 +111,16 @@ class FactorDecoder:
     def announce(self, topology: Topology) -> None:
         """Begins a new epoch of an object; patterns of the last one are dropped."""
         header = topology.header
-        self.objects[header.object] = AnnouncedObject(header.epoch, 3 * topology.nodes, len(topology.columns) // 4)
-        self._unsized.add(header.object)
+        if (last := self.objects.get(header.object)) is not None:
+            last.complete.objects.discard(header.object)
+        shape = topology_checksum(topology)
+        complete = self._complete.setdefault(shape, CompleteFactors())
+        complete.objects.add(header.object)
+        self.objects[header.object] = AnnouncedObject(
+            header.epoch, 3 * topology.nodes, len(topology.columns) // 4, shape, complete
+        )
+        if not complete.largest:
+            self._unsized.add(header.object)
         self._most_blocks = max(known.blocks for known in self.objects.values())
 
     def add_pattern(self, key: object, data: Sized) -> tuple[str, FactorPattern] | None:
@@ -114,7 +167,7 @@ class FactorDecoder:
         ):
             if value != wanted:
                 raise Refused(f"Factor.{name} is {value!r}; allowed: {wanted!r}, as in the matrix", "malformed")
-        pattern = self.objects[job.object].patterns.get(message.pattern)
+        pattern = self.objects[job.object].pattern(message.pattern)
         if pattern is None:
             raise Refused(f"Factor.pattern is {message.pattern:016x}, which was not sent before", "pattern")
         if message.nonzeros != pattern.nonzeros:
@@ -148,7 +201,7 @@ class FactorDecoder:
         seconds, nonzeros = message.seconds[place], message.nonzeros[place]
         if not 0 <= seconds < math.inf:
             raise Refused(f"FactorBatch.seconds has {seconds}; allowed: finite, 0 or more", "malformed")
-        pattern = self.objects[job.object].patterns.get(message.patterns[place])
+        pattern = self.objects[job.object].pattern(message.patterns[place])
         if pattern is None:
             raise Refused(f"FactorBatch.patterns has {message.patterns[place]:016x}, which was not sent", "pattern")
         if nonzeros != pattern.nonzeros:
@@ -174,10 +227,19 @@ class FactorDecoder:
         seconds: float, remedy: str, seen: tuple[int, bool] | None = None,
     ) -> Factor:  # fmt: skip
         check_values(values, pattern, checksum, seen)
-        largest = self.objects[job.object].largest
-        largest[job.method] = max(largest.get(job.method, 0), pattern.nonzeros)
+        known = self.objects[job.object]
+        known.largest[job.method] = max(known.largest.get(job.method, 0), pattern.nonzeros)
         self._unsized.discard(job.object)
+        if job.method == COMPLETE and pattern.id not in known.complete.patterns:
+            self._share(known.complete, pattern)
         return Factor(job.object, job.epoch, job.step, job.warp, pattern, values, job.worker, seconds, remedy[:200])
+
+    def _share(self, complete: CompleteFactors, pattern: FactorPattern) -> None:
+        """Has all objects of a topology know the pattern of a complete factor of one of them."""
+        complete.largest = max(complete.largest, pattern.nonzeros)
+        kept = list(complete.patterns.items())[1 - MAX_PATTERNS :]
+        complete.patterns = {**dict(kept), pattern.id: pattern}  # replaced: another thread may read it
+        self._unsized = self._unsized - complete.objects
 
     def _from_slot(
         self, told: SlotMessage, nonzeros: int, job: InFlightJob

@@ -24,7 +24,7 @@ from sim_server.backends.base import Capability
 from sim_server.backends.cpu.structs import REACTION
 from sim_server.mechanics.world import Body
 from sim_server.simulation import Simulation
-from sim_server.updates.body_state import BodyUpdateState
+from sim_server.updates.body_state import BodyUpdateState, on_factors
 from sim_server.updates.factor_check import FactorCheck
 from sim_server.updates.factor_source import FactorSource, Inline, Job
 from sim_server.updates.patterns import Patterns
@@ -282,19 +282,30 @@ class Driver:
 
     def _take_up(self, factors: Sequence[Factor], reasons: Sequence[str]) -> None:
         """Puts factors into the mailboxes of their bodies. reasons: why each is not to be used; empty if it is."""
-        posted: list[Factor] = []
+        good: list[Factor] = []
         for factor, why in zip(factors, reasons, strict=True):
             if why:
                 self.useless_factors.on_rejected(factor)
                 self.fail(factor.object, f"that of {factor.worker} is not used: {why}", refused=True)
-            elif self.by_name[factor.object].on_factor(factor, self.engine.step):  # else it is older than the newest
-                posted.append(factor)
-                continue
-            self.engine.drop_factor(self.by_name[factor.object].body.index, factor)
+            else:
+                good.append(factor)
+        newer = self._on_factors(good)  # others are older than the newest
+        posted = [factor for factor, better in zip(good, newer, strict=True) if better]
+        used = {id(factor) for factor in posted}
+        for factor in factors:
+            if id(factor) not in used:
+                self.engine.drop_factor(self.by_name[factor.object].body.index, factor)
         bodies = [self.by_name[factor.object].body.index for factor in posted]
         self.engine.post_factors(bodies, posted)
         for factor in posted:
             self._tell(self.by_name[factor.object], factor)
+
+    def _on_factors(self, factors: Sequence[Factor]) -> list[bool]:
+        """Takes note of factors; returns which are newer than those of their bodies."""
+        states, step = [self.by_name[factor.object] for factor in factors], self.engine.step
+        if self.counted or len(factors) < MANY or len({factor.object for factor in factors}) < len(factors):
+            return [state.on_factor(factor, step) for state, factor in zip(states, factors, strict=True)]
+        return on_factors(states, self.table, factors, step)
 
     def _tell(self, state: BodyUpdateState, factor: Factor) -> None:
         """Tells observers, and `auto`, of a factor that the loop was given."""
@@ -306,11 +317,11 @@ class Driver:
             at_end = Capability.MATRIX_POSITIONS not in self.engine.capabilities
             later = state.job.positions and at_end and factor.worker != self.inline.WORKER
             name = method.name if method else factor.method
-            made = replace(
-                factor, ahead=state.job.extrapolated or factor.ahead, later=later or factor.later, method=name
-            )
+            ahead, later = state.job.extrapolated or factor.ahead, later or factor.later
+            if (ahead, later, name) != (factor.ahead, factor.later, factor.method):
+                factor = replace(factor, ahead=ahead, later=later, method=name)
             for observe in self.on_adopt:
-                observe(made)
+                observe(factor)
         # Let `auto` try it
         if state.tuner is not None:
             state.tuner.on_factor(method)

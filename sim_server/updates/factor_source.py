@@ -28,7 +28,7 @@ class Job:
     """A matrix to factorize.
 
     values: float64, blocks of the matrix (blocks, 3, 3), or positions (nodes, 3) [m] from which the worker assembles
-        it; read during `submit` only
+        it; read during `submit`, or until the job is over
     warp: the matrix is in the material frame
     dtype, method: of the factor to be made
     """
@@ -85,6 +85,10 @@ class FactorSource(Protocol):
     def worker_count(self) -> int:
         """Number of workers that may be given jobs, idle or busy."""
         return 1
+
+    def queues_jobs(self) -> bool:
+        """True if workers have several jobs at a time, so that none waits for the next one to travel."""
+        return False
 
     def epoch(self, name: str) -> int | None:
         """Returns the epoch of an object whose jobs it takes; None: of all."""

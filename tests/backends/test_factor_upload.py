@@ -5,6 +5,7 @@ import logging
 import threading
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
+from itertools import count
 from types import SimpleNamespace
 from typing import Any, NamedTuple
 
@@ -50,17 +51,19 @@ class Maker:
         self.thread = ThreadPoolExecutor(1)
         self.fine: set[int] = set()  # values whose inverses need 22 binary digits
         self.planes_used: list[int] = []
-        self.planning: list[Future] | None = None  # plans that are not made yet; None: each is made at once
+        self.planning: list[Future] | None = None  # plans that are not made yet; None: it is made
+        self.planned: Future = Future()
+        self.planned.set_result(SimpleNamespace(builder=self, plan=None))
 
     def planes_for(self, pattern: SimpleNamespace, values: np.ndarray) -> int:
         return 2 if values[0] in self.fine else 1
 
     def begin_plan(self, body: int, pattern: SimpleNamespace, planes: int) -> Future:
+        if self.planning is None and not isinstance(self.fail, ValueError):
+            return self.planned
         made: Future = Future()
         if isinstance(self.fail, ValueError):
             made.set_exception(self.fail)
-        elif self.planning is None:
-            made.set_result(SimpleNamespace(builder=self))
         else:
             self.planning.append(made)
         return made
@@ -73,14 +76,22 @@ class Maker:
         return self.storages[-1]
 
     spared, planes = 8, None
+    most = 3  # inverses that are built together
 
-    def build(self, values: np.ndarray, storage: list[int], multiprocessors: int | None = None) -> PartitionedInverse:
+    def build_many(
+        self, values: list[np.ndarray], storages: list[list[int]], multiprocessors: int | None
+    ) -> list[PartitionedInverse]:
         if self.fail:
             raise self.fail
-        storage[:] = [int(values[0])]
+        assert 0 < len(values) == len(storages) <= self.most
         self.limits.append(multiprocessors)
         self.events.append(Event(self.scene))
-        return PartitionedInverse(storage, self.events[-1])
+        for each, storage in zip(values, storages, strict=True):
+            storage[:] = [int(each[0])]
+        return [PartitionedInverse(storage, self.events[-1]) for storage in storages]
+
+    def reserve_vectors(self, body: int, plan: Any) -> None:
+        return
 
     def apply(self, inverse: PartitionedInverse, r: np.ndarray, multiprocessors: int | None = None) -> np.ndarray:
         """In place of a factor the number that it is."""
@@ -199,7 +210,7 @@ def test_nobody_waits_for_a_plan_and_the_newest_factor_wins(parts):
     scene.loop.run(1)  # goes without
     assert len(plans) == 1 and maker.storages == [] and upload.step(0) == -1
     maker.planning = None
-    plans[0].set_result(SimpleNamespace(builder=maker))
+    plans[0].set_result(SimpleNamespace(builder=maker, plan=None))
     upload.settle()  # the first one is withdrawn, since another waits
     scene.loop.run(1)
     assert used(scene) == [0, 7] and upload.step(0) == 7
@@ -224,14 +235,14 @@ def test_large_factors_are_built_beside_the_caller(parts, monkeypatch):
     scene, maker, upload = parts
     monkeypatch.setattr(module, "SMALL", 0)
     begun, callers = threading.Event(), []
-    build = maker.build
+    build = maker.build_many
 
-    def slow(*arguments: Any) -> PartitionedInverse:
+    def slow(*arguments: Any) -> list[PartitionedInverse]:
         callers.append(threading.current_thread())
         begun.wait(30)
         return build(*arguments)
 
-    maker.build = slow
+    maker.build_many = slow
     post(upload, 5)
     post(upload, 6)
     assert upload.step(0) == -1 and maker.storages in ([], [[]])  # it is under way
@@ -265,13 +276,13 @@ def test_a_prepared_factor_is_built_and_applied_and_used_once_it_is_posted(parts
 
 def test_what_is_posted_before_it_is_built_is_used_then(parts):
     scene, maker, upload = parts
-    go, build = threading.Event(), maker.build
+    go, build = threading.Event(), maker.build_many
 
     def slow(*arguments: Any) -> PartitionedInverse:
         assert go.wait(30)
         return build(*arguments)
 
-    maker.build = slow
+    maker.build_many = slow
     values, _ = prepared(upload, 5)
     upload.post(0, PATTERN, values, 5)
     go.set()
@@ -378,7 +389,7 @@ def test_a_large_factor_is_looked_at_and_built_beside_the_caller(parts, monkeypa
         return choose(*arguments)
 
     def queued(body: int, pattern: SimpleNamespace, planes: int) -> Future:
-        return maker.thread.submit(lambda: SimpleNamespace(builder=maker))
+        return maker.thread.submit(lambda: SimpleNamespace(builder=maker, plan=None))
 
     maker.planes_for = seen
     if waits:
@@ -450,28 +461,30 @@ class Mailbox:
 
     taken, posted = False, 0
 
-    def post(self, data: bytes, keep: Any = None, event: int | None = None) -> None:
+    def post(self, data: bytes, keep: Any = None, event: int | None = None) -> SimpleNamespace:
         self.taken, self.posted = False, keep.step
+        return SimpleNamespace(taken=0)
 
 
 def test_many_are_built_beside_the_caller(many):
     """Who posts them waits for no build; each goes into the mailbox of its body once it is looked at again."""
     maker, upload, boxes = many
-    go, build = threading.Event(), maker.build
+    go, build = threading.Event(), maker.build_many
 
-    def slow(*arguments: Any) -> PartitionedInverse:
+    def slow(*arguments: Any) -> list[PartitionedInverse]:
         assert go.wait(30)
         return build(*arguments)
 
-    maker.build = slow
+    maker.build_many = slow
     values = list(range(1, len(boxes) + 1))
+    assert len(values) == maker.most + 1
     post_all(upload, values)
     upload.advance()
     assert [box.posted for box in boxes] == [0] * len(boxes), "none is built yet"
     go.set()
     maker.thread.submit(lambda: None).result()
     upload.advance()
-    assert [box.posted for box in boxes] == values
+    assert [box.posted for box in boxes] == values and len(maker.events) == 2, "as many at a time as the builder takes"
     post_all(upload, [v + 10 for v in values])  # the mail waits: these do, too
     assert len(maker.storages) == len(boxes)
     for box in boxes:
@@ -490,14 +503,14 @@ def test_few_are_built_at_once(many):
 
 def test_one_of_many_that_cannot_be_used_is_told_alone(many, caplog):
     maker, upload, boxes = many
-    build = maker.build
+    storage, asked = maker.storage, count(1)
 
-    def spoiled(values: np.ndarray, *arguments: Any) -> PartitionedInverse:
-        if values[0] == 2:
+    def spoiled() -> list[int]:
+        if next(asked) == 2:
             raise NoMemory("full")
-        return build(values, *arguments)
+        return storage()
 
-    maker.build = spoiled
+    maker.storage = spoiled
     with caplog.at_level(logging.WARNING):
         post_all(upload, list(range(1, len(boxes) + 1)))
         maker.thread.submit(lambda: None).result()

@@ -164,3 +164,38 @@ def test_another_build_may_make_the_workspace_grow(gpu):
     storage.matrix.fill(0)
     builder.build(values, storage).event.synchronize()
     assert np.array_equal(storage.matrix.get(), before)
+
+
+@pytest.mark.parametrize(("groups", "planes", "limit"), [(1, 1, None), (2, 1, 3), (3, 2, 5)])
+def test_several_at_a_time_have_the_bits_of_each_alone(gpu, groups, planes, limit):
+    """Whatever their number: graphs are made for 1, 4, 16 and 64, and what they leave over is not touched."""
+    from sim_server.backends.gpu.inverse.build_inverse import InverseBuilder
+
+    factors = [factor(SMALL, seed) for seed in range(21)]
+    shape, values = factors[0][0], [each[1] for each in factors]
+    p = plan(shape, 4, groups, planes)
+    alone = [expanded(gpu, shape, each, p, limit) for each in values]
+    builder = InverseBuilder(gpu, shape, p, 64)
+    assert builder.most == 64
+    for count in (1, 2, 4, 5, 21):
+        storages = [builder.storage() for _ in range(22)]
+        made = builder.build_many(values[:count], storages[:count], limit)
+        made[-1].event.synchronize()
+        for storage, inverse, (chunks, scale) in zip(storages, made, alone, strict=False):
+            assert inverse[:2] == (storage.matrix.data.ptr, storage.scale.data.ptr)
+            assert np.array_equal(storage.matrix.get().view(np.uint16), chunks.view(np.uint16))
+            assert np.array_equal(storage.scale.get(), scale)
+        assert not any(storage.scale.get().any() for storage in storages[count:])
+
+
+def test_as_many_at_a_time_as_fit_into_the_workspace(gpu):
+    from sim_server.backends.gpu.inverse.build_inverse import InverseBuilder
+    from sim_server.backends.gpu.inverse.expansion_batches import WORKSPACE
+
+    shape, values = factor(MIDDLE)
+    builder = InverseBuilder(gpu, shape, plan(shape, 132, 1), 64)
+    assert 1 < builder.most < 64 and builder.most * builder._layout.size <= WORKSPACE
+    storages = [builder.storage() for _ in range(builder.most)]
+    builder.build_many([values] * builder.most, storages, None)[0].event.synchronize()
+    chunks = expanded(gpu, shape, values, builder.plan)[0]
+    assert all(np.array_equal(storage.matrix.get().view(np.uint16), chunks.view(np.uint16)) for storage in storages)

@@ -310,7 +310,9 @@ class PcgSolver:
                 f"{pattern.size} degrees of freedom in {blocks} thread blocks need {needed} bytes of shared memory "
                 f"each, allowed: {self._shared}"
             )
-        return PlannedInverse(DevicePlan(self.gpu, found, self.threads // 32), InverseBuilder(self.gpu, pattern, found))
+        alike = (3 * self.bodies["nodes"] == pattern.size) & (self.bodies["blocks"] == blocks)
+        builder = InverseBuilder(self.gpu, pattern, found, int(alike.sum()))
+        return PlannedInverse(DevicePlan(self.gpu, found, self.threads // 32), builder)
 
     def plan(self, body: int, pattern: FactorPattern, planes: int) -> DevicePlan:
         """Returns the plan of the inverse of factors of this pattern for a body; waits until it is made.
@@ -319,15 +321,18 @@ class PcgSolver:
         """
         return self.begin_plan(body, pattern, planes).result().plan
 
+    def reserve_vectors(self, body: int, plan: DevicePlan) -> None:
+        """Allocates the vectors of solves of a body with factors of this plan, unless they are there."""
+        if (key := (body, plan.address)) not in self._vectors:
+            self._vectors[key] = plan.vectors()
+
     def use(self, body: int, pattern: FactorPattern, inverse: PartitionedInverse, planes: int, step: int) -> None:
         """Writes a factor into the host row of a body; it is in use once the row is uploaded."""
         device_plan, row = self.plan(body, pattern, planes), self.bodies[body]
         row["plan"], row["matrix"], row["scale"] = device_plan.address, inverse.matrix, inverse.scale
         row["planes"], row["factor_step"] = planes, step
-        key = (body, device_plan.address)
-        if key not in self._vectors:
-            self._vectors[key] = device_plan.vectors()
-        for name, array in self._vectors[key].items():
+        self.reserve_vectors(body, device_plan)
+        for name, array in self._vectors[body, device_plan.address].items():
             row[name] = array.data.ptr
         self._factor_bytes[body] = device_plan.bytes
 
