@@ -41,7 +41,7 @@ Point = Sequence[float]
 Value = float | bool | str | Sequence[Any]  # of a parameter; text is TOML
 KINDS = ("operator", "participant", "viewer")  # certificates that are taken from a folder with all of them, the first
 LONGEST_SAVE = 60.0  # s that a checkpoint takes to be made and sent, at most
-LONGEST_STEPS = 60.0  # s that a server takes to answer `step`, at most
+LONGEST_STEPS = 60.0  # s that a server takes to answer `step` or `stop`, at most
 FRESH_STATUSES = 3  # times that a status with positions is asked for
 
 
@@ -289,8 +289,12 @@ class Client:
         return reply
 
     def stop(self) -> pb.Reply:
-        """Ends the server, which then closes its log; the status of the reply has the number of steps."""
-        return self.command("stop")
+        """Ends the server, which then closes its log. Returns after the step under way; the status of the reply has the
+        number of steps.
+
+        Returns after a minute if that step takes longer: the status then says "running", and the step is the last one.
+        """
+        return self._ask(self._command("stop", None, None), self.timeout + LONGEST_STEPS)
 
     def add_worker(self) -> str:
         """Has the server start one more local worker; returns its name. Raises BadInput without `--workers`."""

@@ -136,19 +136,18 @@ def summary(arrays: Path) -> Table:
     data = np.load(arrays)
     iterations, age = data["scalars/iterations"], data["scalars/factor_age"]
     milliseconds, residual = 1e3 * data["scalars/step_seconds"], data["scalars/residual"]
-    first, others = milliseconds[0], milliseconds[1:] if len(milliseconds) > 1 else milliseconds
     without, with_factor = iterations[age < 0], iterations[age >= 0]
     table = Table("what the log says", "")
     table.add_row("steps", f"{len(iterations)}")
-    table.add_row("iterations before the first factor", f"{without.mean():.0f}" if len(without) else "-")
+    if len(without):  # the first step waits for its factor, within limits
+        table.add_row("iterations before the first factor", f"{without.mean():.0f}")
     used = len(with_factor) > 0
     shown = f"{with_factor.mean():.1f} / {with_factor.max()}" if used else "no factor came in time"
     table.add_row("iterations with a factor, mean / max", shown)
     table.add_row("age of the factor, mean / max", f"{age[age >= 0].mean():.1f} / {age.max()} steps" if used else "-")
     table.add_row("largest true residual", f"{residual.max():.1e}")
-    percentiles = np.percentile(others, [50, 99, 100])
-    table.add_row("first step, which waits for its factor", f"{first:.0f} ms")
-    table.add_row("other steps, p50 / p99 / max", " / ".join(f"{v:.2f}" for v in percentiles) + " ms")
+    percentiles = np.percentile(milliseconds, [50, 99, 100])
+    table.add_row("time of a step, p50 / p99 / max", " / ".join(f"{v:.2f}" for v in percentiles) + " ms")
     return table
 
 

@@ -62,6 +62,7 @@ class Batch:
             checksum=m.checksums[place], factor_dtype=m.factor_dtype, method=m.method,
             known_patterns=m.known_patterns[first : first + m.known[place]], lease=m.leases[place], worker=m.worker,
             drop_tolerance=m.drop_tolerance, fill=m.fill, omega=m.omega,
+            topology=m.topologies[place] if m.topologies else 0,
         )  # fmt: skip
 
 
@@ -77,6 +78,8 @@ def accept_batch(sample: zenoh.Sample, worker: str, incarnation: int) -> Batch:
     lengths = {name: len(getattr(message, name)) for name in columns}
     if not 0 < count <= MOST_JOBS or any(length != count for length in lengths.values()):
         raise Refused(f"MatrixBatch.jobs has {count} numbers, other fields {lengths}; allowed: as many", "shape")
+    if len(message.topologies) not in (0, count):
+        raise Refused(f"MatrixBatch.topologies has {len(message.topologies)}; allowed: none or {count}", "shape")
     if sum(message.known) != len(message.known_patterns):
         raise Refused(f"MatrixBatch.known_patterns has {len(message.known_patterns)}, not those of `known`", "shape")
     shared = sample.payload.as_shm() is not None

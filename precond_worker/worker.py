@@ -25,10 +25,11 @@ from protocol.messages_pb2 import Factor
 from protocol.method import Method
 from protocol.process.exhausted import exhausted
 from protocol.refused import Refused
-from protocol.validate import array, checksum
+from protocol.validate import array, checksum, copied, topology_checksum
 
 log = logging.getLogger(__name__)
 
+COMPLETE = Method().name
 ANSWER_SECONDS = 3e-3  # s for which answers wait for others of their batch
 
 Analyse = Callable[[Int32, Int32, Method], Factorization]  # registry.make_factorization
@@ -43,9 +44,19 @@ class CachedAnalysis(NamedTuple):
     factorization: Factorization
 
 
+class JobsTogether(NamedTuple):
+    """Jobs whose matrices of one pattern are factorized together, since `begun` [s]."""
+
+    jobs: Sequence[Job]
+    analysis: Any
+    end: Callable[[], NDArray[Any] | None]
+    begun: float
+
+
 class Worker:
     """Does the jobs of one server: the object that waits longest first, of each the newest matrix; together with it
-    those of other objects, where a library factorizes many matrices of one pattern at a time."""
+    those of other objects, where a library factorizes many matrices of one pattern at a time. While it does, the next
+    ones are made ready, and the last ones sent."""
 
     def __init__(
         self, connection: ServerConnection, analyse: Analyse, on_server: Callable[[bool], None] = lambda found: None,
@@ -57,9 +68,12 @@ class Worker:
         self._on_server = on_server
         self._on_factorization = on_factorization
         self._analyses: dict[tuple[str, str], CachedAnalysis] = {}  # by object and name of the method
-        self._patterns: WeakValueDictionary[tuple[bytes, bytes], Factorization] = WeakValueDictionary()
+        self._complete: WeakValueDictionary[int, Factorization] = WeakValueDictionary()  # by topology
+        self._blocks: dict[int, int] = {}  # of a matrix, likewise
         self._assemblers = Assemblers(connection)
         self._pending: dict[str, Job] = {}
+        self._under_way: JobsTogether | None = None
+        self._last_end = 0.0  # when such jobs were done last [s]
         self._answers: dict[int, BatchAnswer] = {}  # by id of the batch; sent before a batch is forgotten
 
     def run(self) -> None:
@@ -75,16 +89,16 @@ class Worker:
     @property
     def idle(self) -> bool:
         """True if no job waits, taken in or not."""
-        return not self._pending and self._connection.received.idle
+        return not self.waiting and self._connection.received.idle
 
     @property
     def waiting(self) -> int:
         """Number of jobs taken in and not done."""
-        return len(self._pending)
+        return len(self._pending) + (0 if self._under_way is None else len(self._under_way.jobs))
 
     def work(self) -> bool:
         """Does one job, or several of one pattern together; returns False if there is none."""
-        if not self._pending:
+        if not self.waiting:
             return False
         try:
             self._work()
@@ -97,10 +111,15 @@ class Worker:
         """Does jobs of one message for a while: their answers leave together. A job that came alone is done alone."""
         end = time.perf_counter() + ANSWER_SECONDS
         while True:
-            jobs = self._next()
-            if len(jobs) == 1 or not self._do_together(jobs):
+            jobs: Sequence[Job] = self._next() if self._pending else ()
+            begun = self._begin_together(jobs) if len(jobs) > 1 else None
+            done, self._under_way = self._under_way, begun
+            if done is not None:
+                self._end_together(done)
+            if begun is None:
                 for job in jobs:
                     self._do(job)
+            jobs = jobs or (done.jobs if done else ())
             following = next(iter(self._pending.values()), None)
             together = following is not None and following.batch is not None and following.batch is jobs[-1].batch
             if not together or time.perf_counter() > end:
@@ -122,29 +141,52 @@ class Worker:
 
     def _known_analysis(self, job: Job) -> Factorization | None:
         """Returns the symbolic phase of a job, if it is done already."""
-        known = self._analyses.get((job.object, job.method.name))
-        same = known is not None and (known.epoch, known.method) == (job.message.header.epoch, job.method)
-        return known.factorization if known is not None and same else None
+        key, epoch = (job.object, job.method.name), job.message.header.epoch
+        known = self._analyses.get(key)
+        if known is not None and (known.epoch, known.method) == (epoch, job.method):
+            return known.factorization
+        alike = self._complete.get(job.message.topology) if job.method.name == COMPLETE else None
+        if alike is not None:
+            self._analyses[key] = CachedAnalysis(epoch, job.method, self._blocks[job.message.topology], alike)
+        return alike
 
-    def _do_together(self, jobs: Sequence[Job]) -> bool:
-        """Factorizes matrices of one pattern together; False if they must be done one by one."""
-        analysis = self._known_analysis(jobs[0])
+    def _begin_together(self, jobs: Sequence[Job]) -> JobsTogether | None:
+        """Begins to factorize matrices of one pattern together; None if they must be done one by one."""
+        analysis: Any = self._known_analysis(jobs[0])
         assert analysis is not None
         try:
             for job in jobs:
                 self._analysis(job)  # the number of blocks is right
-            begin = time.perf_counter()
+            begun = time.perf_counter()
             values = [job.values(self._connection.slots) for job in jobs]
-            factors = analysis.factorize_many(values, np.dtype(jobs[0].message.factor_dtype))  # type: ignore[attr-defined]
-            seconds = (time.perf_counter() - begin) / len(jobs)
+            end = analysis.begin_many(values, np.dtype(jobs[0].message.factor_dtype))
         except DeviceUnusable as error:
-            for job in jobs:
-                self._answer(job, failure=str(error))
+            self._give_up(jobs, error)
             raise
         except (Refused, ValueError, MemoryError):
-            return False
+            return None
+        return None if end is None else JobsTogether(jobs, analysis, end, begun)
+
+    def _give_up(self, jobs: Sequence[Job], error: DeviceUnusable) -> None:
+        waiting = self._under_way.jobs if self._under_way else ()
+        for job in (*waiting, *jobs):
+            self._answer(job, failure=str(error))
+
+    def _end_together(self, together: JobsTogether) -> None:
+        """Waits for factors and answers with them; makes them one by one if one of them has none."""
+        jobs, analysis = together.jobs, together.analysis
+        try:
+            factors = together.end()
+        except DeviceUnusable as error:
+            self._give_up(jobs, error)
+            raise
         if factors is None:
-            return False
+            for job in jobs:
+                self._do(job)
+            return
+        now = time.perf_counter()
+        seconds = (now - max(together.begun, self._last_end)) / len(jobs)  # not what was made before these
+        self._last_end = now
         for job, factor in zip(jobs, factors, strict=True):
             self._count(job)
             self._on_factorization(seconds)
@@ -155,15 +197,14 @@ class Worker:
                 self._counters.refuse(refusal)
             except zenoh.ZError as error:
                 self._counters.trouble("unsent", f"a factor was not sent: {error}")
-        return True
 
     def _done(self) -> None:
-        if not self._pending:
+        if not self.waiting:
             self._connection.received.done()
 
     def take_in(self, timeout: float) -> None:
         """Takes in what was received; without a waiting job, waits up to `timeout` seconds for it."""
-        for item in self._connection.received.take(0.0 if self._pending else timeout):
+        for item in self._connection.received.take(0.0 if self.waiting else timeout):
             if isinstance(item, NameTaken):
                 raise item
             try:
@@ -197,8 +238,9 @@ class Worker:
                 return
 
     def _forget(self) -> None:
-        self._counters.add("superseded", len(self._pending))
+        self._counters.add("superseded", self.waiting)
         self._pending.clear()
+        self._under_way = None
         self._analyses.clear()
         self._assemblers.clear()
         self._connection.offered.clear()
@@ -246,7 +288,7 @@ class Worker:
         analysis = self._analysis(job)
         values = job.values(self._connection.slots)
         assembler = self._assemblers.of(job.object, message.header.epoch) if job.positions else None
-        complete = job.method.name == "cholesky"  # its pattern is known beforehand
+        complete = job.method.name == COMPLETE  # its pattern is known beforehand
         if complete:  # so that the server can prepare for it meanwhile
             self._send_pattern(job, analysis.pattern)
         begin = time.perf_counter()
@@ -268,28 +310,29 @@ class Worker:
     def _analysis(self, job: Job) -> Factorization:
         """Returns the symbolic phase, done once per epoch of an object."""
         object, epoch, blocks = job.object, job.message.header.epoch, job.message.blocks
-        known = self._analyses.get((object, job.method.name))
-        if known is None or (known.epoch, known.method) != (epoch, job.method):
+        if self._known_analysis(job) is None:
             topology = self._connection.topology(object, epoch)
             row_start = array(topology.row_start, np.int32, (topology.nodes + 1,), "Topology.row_start")
             columns = array(topology.columns, np.int32, (-1,), "Topology.columns")
-            analysis = self._shared(row_start, columns, job.method)
-            known = CachedAnalysis(epoch, job.method, len(columns), analysis)
-            self._analyses[object, job.method.name] = known
-            if job.method.name == "cholesky":  # by one of several libraries
+            analysis = self._shared(topology_checksum(topology), row_start, columns, job.method)
+            self._analyses[object, job.method.name] = CachedAnalysis(epoch, job.method, len(columns), analysis)
+            if job.method.name == COMPLETE:  # by one of several libraries
                 self._connection.library = analysis.library
+        known = self._analyses[object, job.method.name]
         if known.blocks != blocks:
             raise Refused(f"Matrix.blocks is {blocks}; allowed: {known.blocks}, as in the topology", "shape")
         return known.factorization
 
-    def _shared(self, row_start: Int32, columns: Int32, method: Method) -> Factorization:
-        """Returns the symbolic phase of a pattern; objects of one pattern share that of complete factors."""
-        if method.name != "cholesky":
+    def _shared(self, topology: int, row_start: Int32, columns: Int32, method: Method) -> Factorization:
+        """Returns the symbolic phase of a pattern; objects of one topology (its checksum) share that of complete
+        factors."""
+        if method.name != COMPLETE:
             return self._analyse(row_start, columns, method)
-        key = row_start.tobytes(), columns.tobytes()
-        known = self._patterns.get(key)
+        known = self._complete.get(topology)
         if known is None:
-            known = self._patterns[key] = self._analyse(row_start, columns, method)
+            known = self._complete[topology] = self._analyse(row_start, columns, method)
+            self._blocks = {each: count for each, count in self._blocks.items() if each in self._complete}
+            self._blocks[topology] = len(columns)
         return known
 
     def _answer(
@@ -319,13 +362,14 @@ class Worker:
         payload = b""
         if pattern is not None and values is not None:
             answer.pattern, answer.nonzeros = pattern.id, pattern.nonzeros
-            in_slot = self._into_slot(message, answer, values)
-            if not in_slot and 0 < WHOLE_PARTS * message.part_bytes < values.nbytes:
+            if self._into_slot(message, answer, values):
+                pass
+            elif 0 < WHOLE_PARTS * message.part_bytes < values.nbytes:
                 number, size = message.header.sequence, message.part_bytes
                 answer.parts.extend(connection.offered.offer(job.object, answer.header, number, values, size))
             else:
                 answer.checksum = checksum(values)
-                payload = b"" if in_slot else values.tobytes()
+                payload = values.tobytes()
         connection.send_factor(answer, payload)
         if values is not None:
             self._counters.add("factors")
@@ -356,13 +400,14 @@ class Worker:
                 self._counters.trouble("unsent", f"factors were not sent: {error}")
 
     def _into_slot(self, message: Any, answer: Factor, values: NDArray[Any]) -> bool:
-        """Writes the values into the slot lent for them; returns False if there is none that is large enough."""
+        """Writes the values into the slot lent for them, and their checksum into the answer; returns False if there is
+        no slot that is large enough."""
         if not message.HasField("factor_slot") or message.factor_slot.capacity < values.nbytes:
             return False
         slot = message.factor_slot
         target = self._connection.slots.array(slot, values.dtype, values.size)
         if not self._connection.slots.is_current(slot):
             raise Refused("the slot for the factor was lent to somebody else: this answer is late", "late")
-        np.copyto(target, values)
+        answer.checksum, _ = copied(values, target, own=values)
         answer.slot.CopyFrom(slot)
         return True

@@ -182,17 +182,22 @@ class Factor:
     method: str = ""
 
 
-def check_values(values: NDArray[Any], pattern: FactorPattern, expected: int | None) -> None:
-    """Raises Refused unless values are a factor of this pattern with this checksum: finite, diagonal positive."""
+def check_values(
+    values: NDArray[Any], pattern: FactorPattern, expected: int | None, seen: tuple[int, bool] | None = None
+) -> None:  # fmt: skip
+    """Raises Refused unless values are a factor of this pattern with this checksum: finite, diagonal positive.
+
+    seen: checksum of the values and whether all are finite, where that is known already (validate.copied)
+    """
     if values.shape != (pattern.nonzeros,) or values.dtype not in (np.float32, np.float64):
         raise Refused(
             f"Factor values are {values.dtype.name} of shape {values.shape}; allowed: float32 or float64 of shape "
             f"({pattern.nonzeros},)",
             "shape",
         )
-    if expected is not None and checksum(values) != expected:
+    if expected is not None and (checksum(values) if seen is None else seen[0]) != expected:
         raise Refused("Factor.checksum does not match the values", "checksum")
-    if not all_finite(values):
+    if not (all_finite(values) if seen is None else seen[1]):
         raise Refused("Factor values hold NaN or infinite numbers; allowed: finite", "not_finite")
     if not (values[pattern.diagonal] > 0).all():
         raise Refused("Factor values: a diagonal entry of L is not positive", "not_positive")

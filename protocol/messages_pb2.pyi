@@ -146,7 +146,7 @@ class Group(_message.Message):
     def __init__(self, name: _Optional[str] = ..., elements: _Optional[bytes] = ..., faces: _Optional[bytes] = ..., nodes: _Optional[bytes] = ...) -> None: ...
 
 class Matrix(_message.Message):
-    __slots__ = ("header", "step", "warp", "blocks", "checksum", "factor_dtype", "method", "known_patterns", "lease", "factor_slot", "matrix_slot", "worker", "drop_tolerance", "fill", "omega", "nodes", "part_bytes")
+    __slots__ = ("header", "step", "warp", "blocks", "checksum", "factor_dtype", "method", "known_patterns", "lease", "factor_slot", "matrix_slot", "worker", "drop_tolerance", "fill", "omega", "nodes", "part_bytes", "topology")
     HEADER_FIELD_NUMBER: _ClassVar[int]
     STEP_FIELD_NUMBER: _ClassVar[int]
     WARP_FIELD_NUMBER: _ClassVar[int]
@@ -164,6 +164,7 @@ class Matrix(_message.Message):
     OMEGA_FIELD_NUMBER: _ClassVar[int]
     NODES_FIELD_NUMBER: _ClassVar[int]
     PART_BYTES_FIELD_NUMBER: _ClassVar[int]
+    TOPOLOGY_FIELD_NUMBER: _ClassVar[int]
     header: Header
     step: int
     warp: bool
@@ -181,7 +182,8 @@ class Matrix(_message.Message):
     omega: float
     nodes: int
     part_bytes: int
-    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., step: _Optional[int] = ..., warp: _Optional[bool] = ..., blocks: _Optional[int] = ..., checksum: _Optional[int] = ..., factor_dtype: _Optional[str] = ..., method: _Optional[str] = ..., known_patterns: _Optional[_Iterable[int]] = ..., lease: _Optional[float] = ..., factor_slot: _Optional[_Union[Slot, _Mapping]] = ..., matrix_slot: _Optional[_Union[Slot, _Mapping]] = ..., worker: _Optional[str] = ..., drop_tolerance: _Optional[float] = ..., fill: _Optional[float] = ..., omega: _Optional[float] = ..., nodes: _Optional[int] = ..., part_bytes: _Optional[int] = ...) -> None: ...
+    topology: int
+    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., step: _Optional[int] = ..., warp: _Optional[bool] = ..., blocks: _Optional[int] = ..., checksum: _Optional[int] = ..., factor_dtype: _Optional[str] = ..., method: _Optional[str] = ..., known_patterns: _Optional[_Iterable[int]] = ..., lease: _Optional[float] = ..., factor_slot: _Optional[_Union[Slot, _Mapping]] = ..., matrix_slot: _Optional[_Union[Slot, _Mapping]] = ..., worker: _Optional[str] = ..., drop_tolerance: _Optional[float] = ..., fill: _Optional[float] = ..., omega: _Optional[float] = ..., nodes: _Optional[int] = ..., part_bytes: _Optional[int] = ..., topology: _Optional[int] = ...) -> None: ...
 
 class FactorPattern(_message.Message):
     __slots__ = ("header", "id", "size", "supernodes", "nonzeros", "permutation", "super_start", "row_start", "rows")
@@ -252,7 +254,7 @@ class FactorPart(_message.Message):
     def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., job: _Optional[int] = ..., number: _Optional[int] = ..., slot: _Optional[_Union[Slot, _Mapping]] = ...) -> None: ...
 
 class MatrixBatch(_message.Message):
-    __slots__ = ("header", "worker", "factor_dtype", "method", "drop_tolerance", "fill", "omega", "matrix_slot", "factor_slot", "objects", "epochs", "jobs", "steps", "warps", "blocks", "checksums", "rooms", "leases", "known", "known_patterns")
+    __slots__ = ("header", "worker", "factor_dtype", "method", "drop_tolerance", "fill", "omega", "matrix_slot", "factor_slot", "objects", "epochs", "jobs", "steps", "warps", "blocks", "checksums", "rooms", "leases", "known", "known_patterns", "topologies")
     HEADER_FIELD_NUMBER: _ClassVar[int]
     WORKER_FIELD_NUMBER: _ClassVar[int]
     FACTOR_DTYPE_FIELD_NUMBER: _ClassVar[int]
@@ -273,6 +275,7 @@ class MatrixBatch(_message.Message):
     LEASES_FIELD_NUMBER: _ClassVar[int]
     KNOWN_FIELD_NUMBER: _ClassVar[int]
     KNOWN_PATTERNS_FIELD_NUMBER: _ClassVar[int]
+    TOPOLOGIES_FIELD_NUMBER: _ClassVar[int]
     header: Header
     worker: str
     factor_dtype: str
@@ -293,7 +296,8 @@ class MatrixBatch(_message.Message):
     leases: _containers.RepeatedScalarFieldContainer[float]
     known: _containers.RepeatedScalarFieldContainer[int]
     known_patterns: _containers.RepeatedScalarFieldContainer[int]
-    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., worker: _Optional[str] = ..., factor_dtype: _Optional[str] = ..., method: _Optional[str] = ..., drop_tolerance: _Optional[float] = ..., fill: _Optional[float] = ..., omega: _Optional[float] = ..., matrix_slot: _Optional[_Union[Slot, _Mapping]] = ..., factor_slot: _Optional[_Union[Slot, _Mapping]] = ..., objects: _Optional[_Iterable[str]] = ..., epochs: _Optional[_Iterable[int]] = ..., jobs: _Optional[_Iterable[int]] = ..., steps: _Optional[_Iterable[int]] = ..., warps: _Optional[_Iterable[bool]] = ..., blocks: _Optional[_Iterable[int]] = ..., checksums: _Optional[_Iterable[int]] = ..., rooms: _Optional[_Iterable[int]] = ..., leases: _Optional[_Iterable[float]] = ..., known: _Optional[_Iterable[int]] = ..., known_patterns: _Optional[_Iterable[int]] = ...) -> None: ...
+    topologies: _containers.RepeatedScalarFieldContainer[int]
+    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., worker: _Optional[str] = ..., factor_dtype: _Optional[str] = ..., method: _Optional[str] = ..., drop_tolerance: _Optional[float] = ..., fill: _Optional[float] = ..., omega: _Optional[float] = ..., matrix_slot: _Optional[_Union[Slot, _Mapping]] = ..., factor_slot: _Optional[_Union[Slot, _Mapping]] = ..., objects: _Optional[_Iterable[str]] = ..., epochs: _Optional[_Iterable[int]] = ..., jobs: _Optional[_Iterable[int]] = ..., steps: _Optional[_Iterable[int]] = ..., warps: _Optional[_Iterable[bool]] = ..., blocks: _Optional[_Iterable[int]] = ..., checksums: _Optional[_Iterable[int]] = ..., rooms: _Optional[_Iterable[int]] = ..., leases: _Optional[_Iterable[float]] = ..., known: _Optional[_Iterable[int]] = ..., known_patterns: _Optional[_Iterable[int]] = ..., topologies: _Optional[_Iterable[int]] = ...) -> None: ...
 
 class FactorBatch(_message.Message):
     __slots__ = ("header", "worker", "jobs", "patterns", "nonzeros", "checksums", "seconds", "failures", "remedies", "slot", "matrix_shared")

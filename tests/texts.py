@@ -10,6 +10,9 @@ import pytest
 
 from sim_server.backends import compiler
 from sim_server.backends.cpu.device import CpuModule, module
+from sim_server.backends.kernel_binding import KernelText
+
+MIXED = {"real": "double", "local": "float"}
 
 
 @contextmanager
@@ -34,3 +37,22 @@ def _single(path: str) -> CpuModule:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(compiler, "FLAGS", ["-O1" if flag == "-O3" else flag for flag in compiler.FLAGS])
         return CpuModule(path, "float")
+
+
+class MixedModule(CpuModule):
+    """A text of the package with the types that a GPU has in mixed precision, item by item as there."""
+
+    def __init__(self, path: str):
+        KernelText.__init__(self, path, MIXED)
+        text = compiler.read_text(path)[1].replace("#define WIDE\n", "")
+        defines = tuple(f"{name}={kind}" for name, kind in MIXED.items())
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(compiler, "FLAGS", ["-O1" if flag == "-O3" else flag for flag in compiler.FLAGS])
+            self._path = compiler.begin(compiler.source_of(path)[0], defines, text)
+        self._layouts = {}
+
+
+@cache
+def mixed(path: str) -> MixedModule:
+    """A text of the package in mixed precision."""
+    return MixedModule(path)

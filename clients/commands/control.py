@@ -125,7 +125,7 @@ def _command(verb: str, connect: Connect, server: str, as_json: bool) -> None:
     from clients.client import Client
 
     with Client(server, connect) as client:
-        reply = client.pause() if verb == "pause" else client.command(verb)
+        reply = {"pause": client.pause, "resume": client.resume, "stop": client.stop}[verb]()
     _print_outcome(verb, reply, as_json)
 
 
@@ -144,7 +144,9 @@ def _print_outcome(verb: str, reply: pb.Reply, as_json: bool) -> None:
         "reset": "put back at",
         "save": "saved at",
     }[verb]
-    if verb in ("pause", "step") and found.state != "paused":
+    if verb == "stop" and found.state == "running":
+        said = "stops after the step under way, with"
+    elif verb in ("pause", "step") and found.state != "paused":
         said = f"{found.state} at"
     elif reply.unchanged:
         said = {"pause": "already paused, at", "resume": "already running, at"}[verb]

@@ -2,7 +2,7 @@
 """Cholesky factors of one object: the symbolic phase once per topology, the numeric phase once per matrix."""
 
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
@@ -35,15 +35,17 @@ class Library(Protocol):
     ) -> tuple[NDArray[np.floating], int]: ...
 
 
+Together = Callable[[], NDArray[np.floating] | None]
+"""Waits for factors that are made together, (k, values); None if one of them has none."""
+
+
 @runtime_checkable
 class ManyLibrary(Protocol):
     """A library that factorizes up to `most` matrices together: GpuFactorization."""
 
     most: int
 
-    def factorize_many(
-        self, matrices: Sequence[Float64], dtype: np.dtype[np.floating]
-    ) -> Sequence[NDArray[np.floating]] | None: ...
+    def begin_many(self, matrices: Sequence[Float64], dtype: np.dtype[np.floating]) -> Together | None: ...
 
 
 class Analysis:
@@ -98,17 +100,16 @@ class Analysis:
         """Number of matrices that are factorized together."""
         return self._library.most if isinstance(self._library, ManyLibrary) else 1
 
-    def factorize_many(
-        self, values: Sequence[ArrayLike], dtype: DTypeLike = np.float32
-    ) -> Sequence[NDArray[np.floating]] | None:  # fmt: skip
-        """Returns the values of L of up to `most` matrices, as `factorize`; None if they must be factorized one by one,
-        as one of them is malformed or has no factor."""
+    def begin_many(self, values: Sequence[ArrayLike], dtype: DTypeLike = np.float32) -> Together | None:
+        """Begins to factorize up to `most` matrices together, and may return before it is done; None if they must be
+        factorized one by one, as one of them is malformed. What is returned waits for the values of L, (k, nonzeros),
+        and returns None if one of them has no factor."""
         matrices = [np.ascontiguousarray(each, np.float64) for each in values]
         wanted = (self._blocks, BLOCK, BLOCK)
         if not isinstance(self._library, ManyLibrary) or any(matrix.shape != wanted for matrix in matrices):
             return None
         kind: np.dtype[Any] = np.dtype(dtype)
-        return self._library.factorize_many(matrices, kind)
+        return self._library.begin_many(matrices, kind)
 
     def modified_ldl(self, matrix: Float64, dtype: DTypeLike, growth: float) -> tuple[NDArray[np.floating], int]:
         """Returns the values of L |D|^1/2 of a matrix that is not positive definite, and the number of negative pivots.

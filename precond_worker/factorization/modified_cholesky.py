@@ -8,13 +8,14 @@
 """
 
 from collections.abc import Sequence
+from functools import partial
 
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from precond_worker.arrays import Float64
 from precond_worker.errors import NotPositiveDefinite, OutOfRange
-from precond_worker.factorization.factorize import Analysis
+from precond_worker.factorization.factorize import Analysis, Together
 from precond_worker.symbolic.blocks import BLOCK, checked_pattern, node_norms, pivot_threshold, rows_of
 from protocol.factor import FactorPattern
 
@@ -49,7 +50,7 @@ class ModifiedCholesky:
         matrix = np.ascontiguousarray(values, np.float64)
         try:
             made = self._analysis.factorize(matrix, dtype)
-            shifted = None if self._sound(made, matrix) else self._shifted(matrix, dtype)
+            shifted = None if self._sound(made[None], [matrix]) else self._shifted(matrix, dtype)
             return made if shifted is None else shifted
         except OutOfRange:
             raise
@@ -65,22 +66,23 @@ class ModifiedCholesky:
         """Number of matrices that are factorized together."""
         return self._analysis.most
 
-    def factorize_many(
-        self, values: Sequence[ArrayLike], dtype: DTypeLike = np.float32
-    ) -> Sequence[NDArray[np.floating]] | None:  # fmt: skip
-        """Returns the values of L of up to `most` matrices; None if one of them may need a remedy, or is malformed."""
+    def begin_many(self, values: Sequence[ArrayLike], dtype: DTypeLike = np.float32) -> Together | None:
+        """Begins to factorize up to `most` matrices together, as Analysis.begin_many. What is returned returns None
+        also if one of them may need a remedy."""
         self.remedy = ""
-        made = self._analysis.factorize_many(values, dtype)
-        if made is None:
-            return None
-        pairs = zip(made, values, strict=True)
-        return made if all(self._sound(each, np.asarray(matrix)) for each, matrix in pairs) else None
+        made = self._analysis.begin_many(values, dtype)
+        return None if made is None else partial(self._end_many, made, [np.asarray(each) for each in values])
 
-    def _sound(self, made: NDArray[np.floating], matrix: Float64) -> bool:
-        """True if every pivot is more than rounding error."""
-        pivots = made[self.pattern.diagonal].astype(np.float64) ** 2
-        diagonal = np.abs(np.diagonal(matrix[self._diagonal], axis1=1, axis2=2)).max(axis=1)
-        return bool((pivots > pivot_threshold(made.dtype) * diagonal[self.pattern.permutation // BLOCK]).all())
+    def _end_many(self, end: Together, matrices: Sequence[Float64]) -> NDArray[np.floating] | None:
+        made = end()
+        return made if made is not None and self._sound(made, matrices) else None
+
+    def _sound(self, made: NDArray[np.floating], matrices: Sequence[Float64]) -> bool:
+        """True if every pivot of some factors (k, values), and their matrices, is more than rounding error."""
+        pivots = made[:, self.pattern.diagonal].astype(np.float64) ** 2
+        entries = np.array([matrix.reshape(-1, BLOCK * BLOCK)[self._diagonal] for matrix in matrices])
+        diagonal = np.abs(entries[:, :, :: BLOCK + 1]).max(axis=2)
+        return bool((pivots > pivot_threshold(made.dtype) * diagonal[:, self.pattern.permutation // BLOCK]).all())
 
     def _modified_ldl(self, matrix: Float64, dtype: DTypeLike) -> NDArray[np.floating] | None:
         try:
@@ -100,7 +102,7 @@ class ModifiedCholesky:
                 made = self._analysis.factorize(more, dtype)
             except NotPositiveDefinite:
                 continue
-            if self._sound(made, more):
+            if self._sound(made[None], [more]):
                 self.remedy = f"diagonal shifted by {shift:g}"
                 return made
         return None

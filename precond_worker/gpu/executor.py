@@ -1,7 +1,9 @@
 # SPDX-License-Identifier: MIT
 """A plan on the device: its tables and memory, and all launches of a factorization as one CUDA graph."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -37,12 +39,13 @@ class Executor:
 
     def __init__(self, plan: MultifrontalPlan, precision: str, stored: str, copies: int = 1):
         self._copies, self._full = copies, copies == 1
-        self._cp, self._plan, self.precision = cupy(), plan, precision
+        self._cp, self.plan, self.precision = cupy(), plan, precision
         self._kernels = kernels(precision, stored)
         self._stored = np.dtype(stored)
         self._list, starts = launch_list(plan)
         self._reserve(starts)
         self.stream = self._cp.cuda.Stream(non_blocking=True)
+        self._running: tuple[NDArray[Any], ...] = ()
         with self.stream:
             self.stream.begin_capture()
             try:
@@ -54,11 +57,11 @@ class Executor:
     @property
     def bytes(self) -> int:
         """Device memory of the large arrays, in bytes."""
-        fronts = sum(self._plan.half) * np.dtype(self.precision).itemsize
-        return fronts + self._plan.nonzeros * self._stored.itemsize + 72 * self._plan.blocks
+        fronts = sum(self.plan.half) * np.dtype(self.precision).itemsize
+        return fronts + self.plan.nonzeros * self._stored.itemsize + 72 * self.plan.blocks
 
     def _reserve(self, starts: Int32) -> None:
-        cp, plan = self._cp, self._plan
+        cp, plan = self._cp, self.plan
         memory = cp.get_default_memory_pool()
         free, total = cp.cuda.runtime.memGetInfo()
         free += memory.free_bytes()
@@ -81,7 +84,6 @@ class Executor:
                 "entry_row": cp.asarray(plan.entry_row),
             }
             self._sent = self._pinned(9 * plan.blocks, np.dtype(np.float64))
-            self._outcome = self._pinned(3, np.dtype(np.int32))
         except (cp.cuda.memory.OutOfMemoryError, cp.cuda.runtime.CUDARuntimeError) as error:
             self.__dict__.clear()
             memory.free_all_blocks()
@@ -105,7 +107,7 @@ class Executor:
     def _arguments(self, launch: KernelLaunch) -> tuple[Any, ...]:
         tables, status = self._tables, self._status
         here, there = self._halves[launch.level % 2], self._halves[1 - launch.level % 2]
-        fronts = np.uint64(tables["fronts"].data.ptr + 64 * int(self._plan.level_start[launch.level]))
+        fronts = np.uint64(tables["fronts"].data.ptr + 64 * int(self.plan.level_start[launch.level]))
         start = np.uint64(tables["starts"].data.ptr + 4 * launch.table)
         step, count = np.int32(launch.step), np.int32(launch.fronts)
         if launch.kernel == "assemble":
@@ -126,26 +128,43 @@ class Executor:
         matrices: one up to as many as the plan is of
         Raises DeviceUnusable if the device fails; this process cannot use it any more.
         """
+        return self.begin(matrices)()
+
+    def begin(self, matrices: Sequence[Float64]) -> Callable[[], tuple[NDArray[Any], Outcome]]:
+        """Begins to factorize matrices; what is returned waits for it and returns what `run` does. Raises as `run`.
+
+        Waits for what this executor began before.
+        """
         sent = self._sent.reshape(self._copies, -1)
         count = len(matrices) if self._full else self._copies
-        for k in range(count):  # at first, and after a failure, also what takes the place of those that are missing
-            np.copyto(sent[k], matrices[min(k, len(matrices) - 1)].reshape(-1))
-        values = self._pinned(len(matrices) * self._plan.nonzeros // self._copies, self._stored)
-        try:
-            self._send_launch_receive(sent[:count], values)
-        except self._cp.cuda.runtime.CUDARuntimeError as error:
-            raise DeviceUnusable(f"the GPU failed: {error}") from error
-        pivot, range_, infinite = (-1 if c == NONE else int(c) for c in self._outcome)
+        values = self._pinned(len(matrices) * self.plan.nonzeros // self._copies, self._stored)
+        outcome = self._pinned(3, np.dtype(np.int32))
+        with self._usable():
+            self.stream.synchronize()
+            self._running = values, outcome  # the device writes to them, whatever becomes of what is returned
+            for k in range(count):  # at first, and after a failure, also what takes the place of those that are missing
+                np.copyto(sent[k], matrices[min(k, len(matrices) - 1)].reshape(-1))
+            self._copy(self._blocks.data.ptr, sent.ctypes.data, sent[:count].nbytes)
+            self._graph.launch(self.stream)
+            self._copy(outcome.ctypes.data, self._status.data.ptr, outcome.nbytes)
+            self._copy(values.ctypes.data, self._values.data.ptr, values.nbytes)
+        self._full = self._copies == 1  # until it is known that none failed
+        return partial(self._end, values.reshape(len(matrices), -1), outcome)
+
+    def _end(self, values: NDArray[Any], found: NDArray[np.int32]) -> tuple[NDArray[Any], Outcome]:
+        with self._usable():
+            self.stream.synchronize()
+        pivot, range_, infinite = (-1 if c == NONE else int(c) for c in found)
         outcome = Outcome(pivot, range_, bool(infinite))
         self._full = self._copies == 1 or outcome == Outcome(-1, -1, False)
-        return values.reshape(len(matrices), -1), outcome
+        return values, outcome
 
-    def _send_launch_receive(self, sent: NDArray[np.float64], values: NDArray[Any]) -> None:
-        self._copy(self._blocks.data.ptr, sent.ctypes.data, sent.nbytes)
-        self._graph.launch(self.stream)
-        self._copy(self._outcome.ctypes.data, self._status.data.ptr, self._outcome.nbytes)
-        self._copy(values.ctypes.data, self._values.data.ptr, values.nbytes)
-        self.stream.synchronize()
+    @contextmanager
+    def _usable(self) -> Iterator[None]:
+        try:
+            yield
+        except self._cp.cuda.runtime.CUDARuntimeError as error:
+            raise DeviceUnusable(f"the GPU failed: {error}") from error
 
     def _copy(self, to: int, source: int, size: int) -> None:
         self._cp.cuda.runtime.memcpyAsync(to, source, size, self._cp.cuda.runtime.memcpyDefault, self.stream.ptr)

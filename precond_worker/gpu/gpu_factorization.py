@@ -8,11 +8,12 @@ from numpy.typing import NDArray
 
 from precond_worker.arrays import Float64, Int32
 from precond_worker.errors import NotPositiveDefinite, OutOfRange
+from precond_worker.factorization.factorize import Together
 from precond_worker.gpu.assembly_tree import assembly_tree
 from precond_worker.gpu.copies import copies
 from precond_worker.gpu.device import best_precision, name, try_out
 from precond_worker.gpu.executor import Executor
-from precond_worker.gpu.plan import make_plan
+from precond_worker.gpu.plan import MultifrontalPlan, make_plan
 from precond_worker.symbolic.elimination import eliminate
 from precond_worker.symbolic.ordering import order_nodes
 from protocol.factor import FactorPattern
@@ -26,7 +27,7 @@ class GpuFactorization:
     """Factors of one block pattern on the current CUDA device.
 
     precision: auto, float32 or float64. L in float64 is always computed in float64.
-    most: matrices that `factorize_many` takes at a time
+    most: matrices that `begin_many` takes at a time
     """
 
     def __init__(self, row_start: Int32, columns: Int32, precision: str = "auto"):
@@ -37,7 +38,7 @@ class GpuFactorization:
         self.pattern = FactorPattern.build(**tree.pattern_arrays())
         self.plan = make_plan(tree, row_start, columns)
         self._tree, self._row_start, self._columns = tree, row_start, columns
-        self._executors: dict[tuple[str, int], Executor] = {}
+        self._executors: dict[tuple[str, int], list[Executor]] = {}
         bytes_of_one = 8 * self.pattern.nonzeros + 72 * len(columns)
         self.most = max(1, min(MOST, BYTES // bytes_of_one))
 
@@ -58,19 +59,24 @@ class GpuFactorization:
         np.copyto(out, values)
         return out
 
-    def factorize_many(
-        self, matrices: Sequence[Float64], dtype: np.dtype[np.floating]
-    ) -> Sequence[NDArray[np.floating]] | None:  # fmt: skip
-        """Returns the values of L of up to `most` matrices, made in the launches of one; None if one of them has none,
-        or the device has too little memory."""
+    def begin_many(self, matrices: Sequence[Float64], dtype: np.dtype[np.floating]) -> Together | None:
+        """Begins to factorize up to `most` matrices in the launches of one; None if the device has too little memory.
+
+        What is returned waits for the values of L, (k, nonzeros), and returns None if one matrix has none. Two such may
+        be under way.
+        """
         try:
-            executor = self.executor(dtype.name, next(c for c in COPIES if c >= len(matrices)))
+            run = self.executor(dtype.name, next(c for c in COPIES if c >= len(matrices))).begin(matrices)
         except MemoryError:
             self.most = 1
             return None
-        values, outcome = executor.run(matrices)
-        failed = outcome.infinite or outcome.pivot >= 0 or outcome.range >= 0
-        return None if failed else list(values)
+
+        def end() -> NDArray[np.floating] | None:
+            values, outcome = run()
+            failed = outcome.infinite or outcome.pivot >= 0 or outcome.range >= 0
+            return None if failed else values
+
+        return end
 
     def modified_ldl(
         self, matrix: Float64, dtype: np.dtype[np.floating], growth: float
@@ -79,15 +85,22 @@ class GpuFactorization:
         raise NotPositiveDefinite("no LDL^T on a GPU")
 
     def executor(self, stored: str, count: int = 1) -> Executor:
-        """Returns the executor for values of L of this type, of `count` matrices at a time; made at the first call."""
-        if (stored, count) not in self._executors:
+        """Returns an executor for values of L of this type, of `count` matrices at a time; made at the first call. Of
+        many there are two, in turn: one may still be at work."""
+        known = self._executors.setdefault((stored, count), [])
+        if len(known) < (2 if count > 1 else 1):
             precision = "float64" if stored == "float64" else self._precision
-            plan = self.plan
-            if count > 1:
-                many = copies(self._tree, self._row_start, self._columns, count)
-                plan = make_plan(many.tree, many.row_start, many.columns)
-            self._executors[stored, count] = Executor(plan, precision, stored, count)
-        return self._executors[stored, count]
+            plan = known[0].plan if known else self._plan_of(count)
+            known.append(Executor(plan, precision, stored, count))
+        else:
+            known.append(known.pop(0))
+        return known[-1]
+
+    def _plan_of(self, count: int) -> MultifrontalPlan:
+        if count == 1:
+            return self.plan
+        many = copies(self._tree, self._row_start, self._columns, count)
+        return make_plan(many.tree, many.row_start, many.columns)
 
 
 def title(precision: str) -> str:

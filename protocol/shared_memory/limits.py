@@ -10,6 +10,7 @@ from pathlib import Path
 
 SHM = Path("/dev/shm")
 POOL_LIMIT = 1 << 30  # bytes of all slots of a server
+SLOT_SHARE = 4  # a larger part of all slots than a SLOT_SHARE-th is not lent for one factor: it goes in parts
 METADATA = 64 << 20  # bytes for segments of zenoh's own
 CAP_IPC_LOCK = 14
 

@@ -7,7 +7,7 @@ a step and the solve between them, and has mailboxes that may be used from anoth
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
@@ -251,6 +251,23 @@ class Engine(Protocol):
 
     def prepare_for_factors(self) -> None:
         """Begins what the first factor would wait for, without waiting."""
+        ...
+
+    def prepare_factor(self, body: int, factor: Factor, r: Float64) -> Callable[[], Float64 | None] | None:
+        """Makes ready what it takes to use a factor, without waiting, and applies it to r (n,) for who checks it. It is
+        used once it is posted; else it must be dropped.
+
+        Returns what waits for P^-1 r, and returns None if it comes to nothing; None: a factor needs no preparation.
+        """
+        ...
+
+    def drop_factor(self, body: int, factor: Factor) -> None:
+        """Gives up a factor that may have been prepared, and is not posted."""
+        ...
+
+    def factor_memory(self, count: int, dtype: np.dtype[Any]) -> NDArray[Any]:
+        """Makes an array for values of a factor, (count,), from which `post_factors` takes them with fewest copies.
+        From any thread."""
         ...
 
     def expect_factors(self, body: int, pattern: FactorPattern) -> None:

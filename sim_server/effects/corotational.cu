@@ -71,15 +71,18 @@ struct CorotationalEnergy {
     local* energy;           // (n,) out: V (mu |S - I|^2 + lambda / 2 tr(S - I)^2), S = R^T F [J]
 };
 
+// In single precision S - I would leave a stiff element the rounding of F.
 KERNEL(energy, CorotationalEnergy) {
+    typedef exact_number T;
     index tet[4];
     get_item_row(p.tets, i, tet);
-    local_mat3 F = gradient(p.x, tet, rest_gradients(p.gradients, p.n, i));
-    local_mat3 S = mul(transposed(nearest_rotation(F)), F);
-    local_number square = local_number{}, dilation = trace(S) - 3;
+    mat<T> F = gradient(p.x, tet, as<T>(rest_gradients(p.gradients, p.n, i)));
+    mat<T> S = mul(transposed(nearest_rotation(F)), F);
+    T square = T{}, dilation = trace(S) - 3;
     for (int k = 0; k < 9; ++k) {
-        local_number e = k % 4 == 0 ? S.m[k] - 1 : S.m[k];
+        T e = k % 4 == 0 ? S.m[k] - 1 : S.m[k];
         square += e * e;
     }
-    put(p.energy, i, at_items(p.lame + p.n, i) * square + (local)0.5 * at_items(p.lame, i) * dilation * dilation);
+    T energy = at_items(p.lame + p.n, i) * square + (entry<T>)0.5 * at_items(p.lame, i) * dilation * dilation;
+    put(p.energy, i, (local_number)energy);
 }

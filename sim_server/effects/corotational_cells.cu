@@ -185,15 +185,16 @@ struct CorotationalCellEnergy {
 };
 
 KERNEL(energy, CorotationalCellEnergy) {
-    const local_mat3 F = cell_gradient(cell_slots(p.first, p.width, i), p.nodes, p.gradients, p.slots, p.x);
-    const local_mat3 S = mul(transposed(nearest_rotation(F)), F);
-    const local_number trace3 = trace(S) - 3, mean = (local)(1.0 / 3) * trace3 + 1;
-    local_number square = local_number{};
+    typedef exact_number T;  // as that of corotational.cu
+    const mat<T> F = cell_gradient<T>(cell_slots(p.first, p.width, i), p.nodes, p.gradients, p.slots, p.x);
+    const mat<T> S = mul(transposed(nearest_rotation(F)), F);
+    const T trace3 = trace(S) - 3, mean = (entry<T>)(1.0 / 3) * trace3 + 1;
+    T square = T{};
     for (int k = 0; k < 9; ++k) {
-        local_number e = k % 4 == 0 ? S.m[k] - mean : S.m[k];
+        T e = k % 4 == 0 ? S.m[k] - mean : S.m[k];
         square += e * e;
     }
-    const local_number mu = at_items(p.moduli, i), bulk = (local)0.5 * cell_lambda(p, i) + (local)(1.0 / 3) * mu;
-    put(p.energy, i, mu * square + bulk * trace3 * trace3);
-    put(p.dilatation, i, at_items(p.volume, i) * trace3);
+    const T mu = at_items(p.moduli, i), bulk = (entry<T>)0.5 * cell_lambda(p, i) + (entry<T>)(1.0 / 3) * mu;
+    put(p.energy, i, (local_number)(mu * square + bulk * trace3 * trace3));
+    put(p.dilatation, i, (local_number)(at_items(p.volume, i) * trace3));
 }

@@ -19,12 +19,12 @@ struct CorotationalQrElements {
 };
 
 // Rotation from the frame of edge 01 and face 012 at rest to the present one.
-INLINE local_mat3 edge_face_rotation(const real* x, const index (&tet)[4], const local_mat3& g) {
+template <class T> INLINE mat<T> edge_face_rotation(const real* x, const index (&tet)[4], const mat<T>& g) {
     vec3 origin = load3(x, tet[0]);
-    local_vec3 first = as<local_number>(load3(x, tet[1]) - origin), second = as<local_number>(load3(x, tet[2]) - origin);
+    vec<T> first = as<T>(load3(x, tet[1]) - origin), second = as<T>(load3(x, tet[2]) - origin);
     // At rest: N_3 rises off the face, N_2 and N_3 are constant along the edge. In units of rest lengths no scale is special.
-    local_vec3 edge = cross(row(g, 1), row(g, 2));
-    local_number per_volume = dot(row(g, 0), edge), scale = per_volume / sqrt(dot(edge, edge));  // 1 / length
+    vec<T> edge = cross(row(g, 1), row(g, 2));
+    T per_volume = dot(row(g, 0), edge), scale = per_volume / sqrt(dot(edge, edge));  // 1 / length
     return rotation_between(unit(edge), unit(row(g, 2)), scale * first, scale * second);
 }
 
@@ -51,12 +51,15 @@ struct CorotationalQrEnergy {
 };
 
 KERNEL(energy, CorotationalQrEnergy) {
+    typedef exact_number T;  // as that of corotational.cu
+    const entry<T> half = 0.5;
     index tet[4];
     get_item_row(p.tets, i, tet);
-    local_mat3 g = rest_gradients(p.gradients, p.n, i);
-    local_mat3 S = mul(transposed(edge_face_rotation(p.x, tet, g)), gradient(p.x, tet, g));
-    local_number xx = S.m[0] - 1, yy = S.m[4] - 1, zz = S.m[8] - 1, dilation = xx + yy + zz;
-    local_number xy = S.m[1] + S.m[3], xz = S.m[2] + S.m[6], yz = S.m[5] + S.m[7];
-    local_number square = xx * xx + yy * yy + zz * zz + (local)0.5 * (xy * xy + xz * xz + yz * yz);
-    put(p.energy, i, at_items(p.lame + p.n, i) * square + (local)0.5 * at_items(p.lame, i) * dilation * dilation);
+    mat<T> g = as<T>(rest_gradients(p.gradients, p.n, i));
+    mat<T> S = mul(transposed(edge_face_rotation(p.x, tet, g)), gradient(p.x, tet, g));
+    T xx = S.m[0] - 1, yy = S.m[4] - 1, zz = S.m[8] - 1, dilation = xx + yy + zz;
+    T xy = S.m[1] + S.m[3], xz = S.m[2] + S.m[6], yz = S.m[5] + S.m[7];
+    T square = xx * xx + yy * yy + zz * zz + half * (xy * xy + xz * xz + yz * yz);
+    T energy = at_items(p.lame + p.n, i) * square + half * at_items(p.lame, i) * dilation * dilation;
+    put(p.energy, i, (local_number)energy);
 }

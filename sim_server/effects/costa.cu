@@ -102,11 +102,12 @@ struct CostaEnergy {
 };
 
 KERNEL(energy, CostaEnergy) {
-    typedef local_number T;
+    typedef exact_number T;  // as that of hyperelastic.cu
     index tet[4];
-    Tetrahedron<T> t = element_at(p, i, tet);
+    Tetrahedron<T> t = element_at<T>(p, i, tet);
     T c[CONSTANTS], s[6];
     constants_at(p, i, c);
     T W = (entry<T>)0.5 * (exponential(c, t.F, s) - c[0]) + c[7] * (t.J * log(t.J) - t.J + 1);
-    put(p.energy, i, t.J <= 0 ? no_number<T>() : at_items(p.volume, i) * W);
+    W = t.J <= 0 ? no_number<T>() : at_items(p.volume, i) * W;
+    put(p.energy, i, (local_number)W);
 }

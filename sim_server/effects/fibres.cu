@@ -69,9 +69,9 @@ struct FibresEnergy {
 };
 
 KERNEL(energy, FibresEnergy) {
-    typedef local_number T;
+    typedef exact_number T;  // as that of hyperelastic.cu
     index tet[4];
-    Tetrahedron<T> t = element_at(p, i, tet);
+    Tetrahedron<T> t = element_at<T>(p, i, tet);
     T k1 = at_items(p.constants, i), k2 = at_items(p.constants + p.n, i), W = T{};
     for (int which = 0; which < 2; ++which) {
         T y = family(p.directions, p.n, i, which, t.F).stretch, z = k2 * y * y;
@@ -79,5 +79,5 @@ KERNEL(energy, FibresEnergy) {
         T quotient = z > few ? (exp(z) - 1) / (z + (entry<T>)1e-37) : 1 + (entry<T>)0.5 * z;  // (e^z - 1) / z
         W += (entry<T>)0.5 * k1 * y * y * quotient;
     }
-    put(p.energy, i, at_items(p.volume, i) * W);
+    put(p.energy, i, (local_number)(at_items(p.volume, i) * W));
 }

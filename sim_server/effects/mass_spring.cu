@@ -18,8 +18,8 @@ struct Springs {
 };
 
 // From the first end to the second: the difference of a nodal field in the field's precision.
-INLINE local_vec3 difference(const real* field, const int* ends, index i) {
-    return as<local_number>(load3(field, at(ends, 2 * i + 1)) - load3(field, at(ends, 2 * i)));
+template <class T = local_number> INLINE vec<T> difference(const real* field, const int* ends, index i) {
+    return as<T>(load3(field, at(ends, 2 * i + 1)) - load3(field, at(ends, 2 * i)));
 }
 
 // 1 / l; finite where the ends meet: the spring then has no direction and neither pulls nor pushes.
@@ -47,7 +47,8 @@ struct MassSpringEnergy {
 };
 
 KERNEL(energy, MassSpringEnergy) {
-    local_vec3 d = difference(p.x, p.ends, i);
-    local_number longer = sqrt(dot(d, d)) - at_items(p.length, i);
-    put(p.energy, i, (local)0.5 * at_items(p.stiffness, i) * longer * longer);
+    typedef exact_number T;  // in single precision a stiff spring would have the rounding of its length
+    vec<T> d = difference<T>(p.x, p.ends, i);
+    T longer = sqrt(dot(d, d)) - at_items(p.length, i);
+    put(p.energy, i, (local_number)((entry<T>)0.5 * at_items(p.stiffness, i) * longer * longer));
 }

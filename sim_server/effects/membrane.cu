@@ -12,10 +12,9 @@ template <class T> struct Triangle {
 };
 
 // corners (n, 4) nodes, the first of them again as the last; gradients (4, n): at rest, x and y of corners 1 and 2 [1/m].
-template <class P> INLINE Triangle<local_number> triangle_at(const P& p, index i, index (&corner)[4]) {
-    typedef local_number T;
+template <class T, class P> INLINE Triangle<T> triangle_at(const P& p, index i, index (&corner)[4]) {
     get_item_row(p.corner, i, corner);
-    local_vec3 edges[3];
+    vec<T> edges[3];
     field_edges(p.x, corner, edges);
     T D[4];
     UNROLL for (int k = 0; k < 4; ++k) D[k] = at_items(p.gradients + k * p.n, i);
@@ -86,7 +85,7 @@ KERNEL(elements, Membrane) {
     typedef local_number T;
     index corner[4];
     local_vec3 v[3], impulse[4];
-    Triangle<T> t = triangle_at(p, i, corner);
+    Triangle<T> t = triangle_at<T>(p, i, corner);
     field_edges(p.v, corner, v);
     T mu = at_items(p.constants, i), nu = at_items(p.constants + p.n, i), volume = at_items(p.volume, i);
     Jet<T> L = logarithm(t.J, T{} + (local)MEMBRANE_FLOOR);
@@ -128,11 +127,12 @@ struct MembraneEnergy {
 };
 
 KERNEL(energy, MembraneEnergy) {
-    typedef local_number T;
+    typedef exact_number T;  // as that of hyperelastic.cu
     index corner[4];
-    Triangle<T> t = triangle_at(p, i, corner);
-    T mu = at_items(p.constants, i), nu = at_items(p.constants + p.n, i), L = logarithm(t.J, T{} + (local)MEMBRANE_FLOOR).f;
+    Triangle<T> t = triangle_at<T>(p, i, corner);
+    T mu = at_items(p.constants, i), nu = at_items(p.constants + p.n, i), L = logarithm(t.J, T{} + (entry<T>)MEMBRANE_FLOOR).f;
     T z = across(L, nu), e = exp(2 * z);
     const entry<T> half = 0.5;
-    put(p.energy, i, at_items(p.volume, i) * mu * (half * (t.I1 + e - 3 - (e - 1) * (L + z)) - (L + z)));
+    T W = mu * (half * (t.I1 + e - 3 - (e - 1) * (L + z)) - (L + z));
+    put(p.energy, i, (local_number)(at_items(p.volume, i) * W));
 }

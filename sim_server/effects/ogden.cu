@@ -104,12 +104,13 @@ struct OgdenEnergy {
 };
 
 KERNEL(energy, OgdenEnergy) {
-    typedef local_number T;
+    typedef exact_number T;  // as that of hyperelastic.cu
     index tet[4];
-    Tetrahedron<T> e = element_at(p, i, tet);
+    Tetrahedron<T> e = element_at<T>(p, i, tet);
     T c[CONSTANTS], t[3], m[6];
     constants_at(p, i, c);
     Principal<T> frame = principal(e.F);
     T W = logarithmic(c, frame.s, e.J, t, m);
-    put(p.energy, i, e.J <= 0 ? no_number<T>() : at_items(p.volume, i) * W);
+    W = e.J <= 0 ? no_number<T>() : at_items(p.volume, i) * W;
+    put(p.energy, i, (local_number)W);
 }

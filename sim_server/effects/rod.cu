@@ -20,12 +20,12 @@ struct Rods {
 };
 
 // sum of W times a nodal field: weights of sum 0, so that differences from the first corner do
-template <class P> INLINE local_vec3 weighted(const P& p, const real* field, index i) {
+template <class T = local_number, class P> INLINE vec<T> weighted(const P& p, const real* field, index i) {
     const vec3 first = load3(field, at(p.nodes, p.corners * i));
     vec3 sum = {number{}, number{}, number{}};
     for (int a = 1; a < p.corners; ++a)
         sum = sum + at(p.weights, p.corners * i + a) * (load3(field, at(p.nodes, p.corners * i + a)) - first);
-    return as<local_number>(sum);
+    return as<T>(sum);
 }
 
 // 1 / l; finite where d vanishes: it then has no direction.
@@ -55,7 +55,8 @@ struct RodEnergy {
 };
 
 KERNEL(energy, RodEnergy) {
-    local_vec3 d = weighted(p, p.x, i);
-    local_number longer = sqrt(dot(d, d)) - at_items(p.length, i);
-    put(p.energy, i, (local)0.5 * at_items(p.stiffness, i) * longer * longer);
+    typedef exact_number T;  // as that of mass_spring.cu
+    vec<T> d = weighted<T>(p, p.x, i);
+    T longer = sqrt(dot(d, d)) - at_items(p.length, i);
+    put(p.energy, i, (local_number)((entry<T>)0.5 * at_items(p.stiffness, i) * longer * longer));
 }

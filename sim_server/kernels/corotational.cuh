@@ -11,10 +11,9 @@ INLINE local_mat3 rest_gradients(const local* gradients, int n, index i) {
 }
 
 // Gradient of a nodal field over the element: its differences in the field's precision.
-INLINE local_mat3 gradient(const real* field, const index (&tet)[4], const local_mat3& g) {
+template <class T> INLINE mat<T> gradient(const real* field, const index (&tet)[4], const mat<T>& g) {
     vec3 u = load3(field, tet[0]);
-    return outer3(as<local_number>(load3(field, tet[1]) - u), as<local_number>(load3(field, tet[2]) - u),
-                  as<local_number>(load3(field, tet[3]) - u), g);
+    return outer3(as<T>(load3(field, tet[1]) - u), as<T>(load3(field, tet[2]) - u), as<T>(load3(field, tet[3]) - u), g);
 }
 
 // Stress of h (strain) + k (strain rate), times V, in the frame of the element; S = R^T F, T = R^T G.

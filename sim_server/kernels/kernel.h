@@ -79,7 +79,6 @@ template <class T> using own = T*;
 #define OUT_OF_LINE static __attribute__((noinline, unused))
 #define UNROLL _Pragma("GCC unroll 16")
 template <class T> using own = T*;
-template <class T> using entry = real;
 // `begin`..`end` lets the caller share a launch between threads.
 #define KERNEL(name, Params)                                                          \
     INLINE void name##_item(const Params& p, index i);                                \
@@ -102,6 +101,9 @@ template <class T> using entry = real;
 #endif
 constexpr int LANES = REGISTER / sizeof(real);
 typedef real number __attribute__((vector_size(REGISTER)));
+typedef number local_number;
+typedef number exact_number;
+template <class T> using entry = real;
 typedef int index __attribute__((vector_size(LANES * sizeof(int))));
 
 INLINE index items(int first, int last) {
@@ -169,6 +171,9 @@ INLINE bool any(index a) {
 
 constexpr int LANES = 1;
 typedef real number;
+typedef local local_number;
+typedef double exact_number;
+template <class T> using entry = T;
 typedef int index;
 INLINE index items(int first, int) { return first; }
 using std::sqrt;
@@ -180,8 +185,6 @@ INLINE bool any(bool mask) { return mask; }
 INLINE void mark(int* a, index i, bool mask) { if (mask) a[i] = 1; }
 
 #endif
-typedef number local_number;
-typedef number exact_number;
 #endif
 
 #if !defined(WIDE) || defined(__CUDACC_RTC__)

@@ -28,7 +28,7 @@ template <int K> INLINE void put_slot(local* a, index slot, index i, int n, cons
 }
 
 // F += u (x) g
-INLINE void add_outer(local_mat3& F, local_vec3 u, local_vec3 g) {
+template <class T> INLINE void add_outer(mat<T>& F, vec<T> u, vec<T> g) {
     F.m[0] += u.x * g.x; F.m[1] += u.x * g.y; F.m[2] += u.x * g.z;
     F.m[3] += u.y * g.x; F.m[4] += u.y * g.y; F.m[5] += u.y * g.z;
     F.m[6] += u.z * g.x; F.m[7] += u.z * g.y; F.m[8] += u.z * g.z;
@@ -48,13 +48,14 @@ INLINE void cell_gradients(const slots& s, const int* nodes, const local* gradie
     }
 }
 
-INLINE local_mat3 cell_gradient(const slots& s, const int* nodes, const local* gradients, int count, const real* x) {
+template <class T>
+INLINE mat<T> cell_gradient(const slots& s, const int* nodes, const local* gradients, int count, const real* x) {
     const index first = at(nodes, s.first);
     const vec3 x0 = load3(x, first);
-    local_mat3 F = {};
+    mat<T> F = {};
     for (int k = 1; any(s.width > k); ++k) {
         const index slot = slot_of(s, k, count - 1), node = s.width > k ? at(nodes, slot) : first;
-        add_outer(F, as<local_number>(load3(x, node) - x0), slot_gradient(gradients, count, slot));
+        add_outer(F, as<T>(load3(x, node) - x0), as<T>(slot_gradient(gradients, count, slot)));
     }
     return F;
 }

@@ -2,6 +2,7 @@
 """Several jobs in one message: their matrices one after another in one slot, and rooms for their factors in another."""
 
 from collections.abc import Sequence
+from itertools import chain
 from typing import NamedTuple
 
 import numpy as np
@@ -11,6 +12,7 @@ from protocol.messages_pb2 import Header, MatrixBatch
 from protocol.method import Method
 from protocol.shared_memory.pool import Slot
 from protocol.validate import checksum
+from sim_server.arrays import Float64
 from sim_server.network.factor_decoder import AnnouncedObject
 from sim_server.network.leases import InFlightJob
 from sim_server.updates.factor_source import Job
@@ -32,7 +34,7 @@ def entries_of(jobs: Sequence[tuple[Job, AnnouncedObject]]) -> list[Entry]:
     """Lays out the rooms of factors that are as large as the largest so far."""
     made, first = [], 0
     for job, known in jobs:
-        size = known.largest[job.method.name] * np.dtype(job.dtype).itemsize
+        size = known.most_values(job.method.name) * np.dtype(job.dtype).itemsize
         room = -(-size // ALIGNMENT) * ALIGNMENT
         made.append(Entry(job, known, room, first))
         first += room
@@ -43,18 +45,12 @@ def batch_message(
     entries: Sequence[Entry], in_flight: Sequence[InFlightJob], leases: Sequence[float], incarnation: int,
     matrix_slot: Slot, factor_slot: Slot,
 ) -> MatrixBatch:  # fmt: skip
-    """Copies the matrices into their slot and returns the message of the batch.
+    """Returns the message of a batch without checksums, which `fill` adds.
 
     entries, in_flight, leases: of the same jobs; leases: time [s] that the worker has for the answer
     """
     first, method = entries[0].job, entries[0].job.method
-    values = matrix_slot.array(np.float64, sum(entry.job.values.size for entry in entries))
-    checksums, begin = [], 0
-    for entry in entries:
-        part = values[begin : begin + entry.job.values.size]
-        np.copyto(part.reshape(entry.job.values.shape), entry.job.values)
-        checksums.append(checksum(part))
-        begin += part.size
+    known = [entry.known.known_patterns for entry in entries]
     return MatrixBatch(
         header=Header(protocol=PROTOCOL, incarnation=incarnation, sequence=in_flight[-1].number),
         worker=in_flight[0].worker, factor_dtype=first.dtype, method=method.name,
@@ -63,10 +59,19 @@ def batch_message(
         objects=[entry.job.object for entry in entries], epochs=[entry.job.epoch for entry in entries],
         jobs=[job.number for job in in_flight], steps=[entry.job.step for entry in entries],
         warps=[entry.job.warp for entry in entries], blocks=[entry.known.blocks for entry in entries],
-        checksums=checksums, rooms=[entry.room for entry in entries], leases=leases,
-        known=[len(entry.known.patterns) for entry in entries],
-        known_patterns=[id for entry in entries for id in entry.known.patterns],
+        rooms=[entry.room for entry in entries], leases=leases,
+        known=map(len, known), known_patterns=chain(*known), topologies=[entry.known.topology for entry in entries],
     )  # fmt: skip
+
+
+def fill(message: MatrixBatch, matrices: Sequence[Float64], slot: Slot) -> None:
+    """Copies the matrices of a batch into their slot, and their checksums into its message. From any thread."""
+    values, begin = slot.array(np.float64, sum(matrix.size for matrix in matrices)), 0
+    for matrix in matrices:
+        part = values[begin : begin + matrix.size]
+        np.copyto(part.reshape(matrix.shape), matrix)
+        message.checksums.append(checksum(part))
+        begin += part.size
 
 
 def group(job: Job) -> tuple[str, Method]:

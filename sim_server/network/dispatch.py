@@ -29,7 +29,7 @@ from sim_server.network.worker_choice import WorkerChoice
 from sim_server.network.worker_registry import WorkerRegistry
 from sim_server.network.worker_reliability import WorkerReliability
 from sim_server.network.worker_timing import WorkerTiming
-from sim_server.updates.factor_source import FactorSource, Job
+from sim_server.updates.factor_source import FactorMemory, FactorSource, Job
 
 log = logging.getLogger(__name__)
 
@@ -125,7 +125,8 @@ class Dispatch(FactorSource):
     def submit_many(self, jobs: Sequence[Job]) -> list[bool]:
         """Sends jobs of different objects, the most urgent first, those of small objects to one worker in one message.
 
-        False for those for which no worker has room, or whose object has a job in flight.
+        False for those for which no worker has room, or whose object has a job in flight. Matrices are read until their
+        jobs are over: what is sent of one that changes before is of a job that nobody waits for.
         """
         with self._lock:
             self._receive()
@@ -151,6 +152,10 @@ class Dispatch(FactorSource):
             failures, self._book.failures = self._book.failures, []
             return failures
 
+    def use_memory(self, memory: FactorMemory) -> None:
+        """Has large factors that arrive put into arrays that `memory` makes."""
+        self.decoder.memory = memory
+
     def worker_count(self) -> int:
         """Number of workers that may be given jobs, idle or busy."""
         return len(self.workers())
@@ -159,6 +164,12 @@ class Dispatch(FactorSource):
         """True if there are workers and all of them can assemble matrices from positions."""
         infos = self.workers()
         return bool(infos) and all(info.builds for info in infos)
+
+    def queues_jobs(self) -> bool:
+        """True if there are workers and all of them have several jobs at a time."""
+        with self._lock:
+            available = self._book.available()
+            return bool(available) and all(self._choice.most_waiting(name) > 1 for name in available)
 
     def faster_busy_workers(self) -> int:
         """Number of busy workers that would finish one more job before the fastest idle one could."""
@@ -206,6 +217,7 @@ class Dispatch(FactorSource):
             except Refused as refusal:
                 self._counters.refuse(refusal)
         self._intake.take_decoded()
+        self._sender.give_back_sent()
         self._query_tokens()
         if self._clock() >= self._looked_at + LOOK_PERIOD:  # many jobs are submitted one after another
             self._looked_at = self._clock()

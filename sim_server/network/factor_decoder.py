@@ -4,6 +4,7 @@
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from weakref import WeakValueDictionary
 
 import numpy as np
 
@@ -13,12 +14,40 @@ from protocol.messages_pb2 import Factor as FactorMessage
 from protocol.messages_pb2 import FactorBatch, Topology
 from protocol.messages_pb2 import FactorPattern as PatternMessage
 from protocol.messages_pb2 import Slot as SlotMessage
+from protocol.method import Method
 from protocol.refused import Refused
-from protocol.validate import Sized, array, check_header, check_numbers, check_strings, parse, take
+from protocol.validate import (
+    Sized,
+    array,
+    check_header,
+    check_numbers,
+    check_strings,
+    copied,
+    parse,
+    take,
+    topology_checksum,
+)
 from sim_server.arrays import Float32, Float64
 from sim_server.network.leases import InFlightJob
+from sim_server.updates.factor_source import FactorMemory
 
+COMPLETE = Method().name
+LARGE = 1 << 20  # bytes of a factor for which `memory` is asked
 MAX_PATTERNS = 4  # kept per object: one for each library among its workers
+
+
+@dataclass
+class CompleteFactors:
+    """What objects whose matrices have one pattern share.
+
+    patterns: of their complete factors, by id
+    largest: values of the largest of these; 0: there was none
+    objects: their names
+    """
+
+    patterns: dict[int, FactorPattern] = field(default_factory=dict)
+    largest: int = 0
+    objects: set[str] = field(default_factory=set)
 
 
 @dataclass
@@ -27,6 +56,8 @@ class AnnouncedObject:
 
     size: degrees of freedom
     blocks: 3x3 blocks of its matrix
+    topology: checksum of the pattern of its matrix
+    complete: shared with objects of this topology
     patterns: of L, by id
     largest: number of values of the largest factor so far, by method
     """
@@ -34,18 +65,38 @@ class AnnouncedObject:
     epoch: int
     size: int
     blocks: int
+    topology: int = 0
+    complete: CompleteFactors = field(default_factory=CompleteFactors)
     patterns: dict[int, FactorPattern] = field(default_factory=dict)
     largest: dict[str, int] = field(default_factory=dict)
 
+    def pattern(self, id: int) -> FactorPattern | None:
+        """Returns a pattern that a worker has sent for this object, or that a factor of one like it had."""
+        return self.patterns.get(id) or self.complete.patterns.get(id)
+
+    @property
+    def known_patterns(self) -> list[int]:
+        """Ids of these patterns."""
+        return list(dict.fromkeys((*self.patterns, *self.complete.patterns)))
+
+    def most_values(self, method: str) -> int:
+        """Number of values of the largest factor by a method so far, also of objects like it; 0: there was none."""
+        return max(self.largest.get(method, 0), self.complete.largest if method == COMPLETE else 0)
+
 
 class FactorDecoder:
-    """Decodes messages of workers about objects that were announced. Its methods raise Refused."""
+    """Decodes messages of workers about objects that were announced. Its methods raise Refused.
+
+    memory: makes the arrays that large factors are copied to (FactorSource.use_memory)
+    """
 
     def __init__(self, incarnation: int):
         self._incarnation = incarnation
+        self.memory: FactorMemory = np.empty
         self.objects: dict[str, AnnouncedObject] = {}
         self._most_blocks = 0
-        self._unsized: set[str] = set()  # objects that have had no factor in this epoch
+        self._unsized: set[str] = set()  # objects that have had no factor in this epoch, nor has one like them
+        self._complete: WeakValueDictionary[int, CompleteFactors] = WeakValueDictionary()  # by topology
 
     @property
     def most_blocks(self) -> int:
@@ -60,8 +111,16 @@ class FactorDecoder:
     def announce(self, topology: Topology) -> None:
         """Begins a new epoch of an object; patterns of the last one are dropped."""
         header = topology.header
-        self.objects[header.object] = AnnouncedObject(header.epoch, 3 * topology.nodes, len(topology.columns) // 4)
-        self._unsized.add(header.object)
+        if (last := self.objects.get(header.object)) is not None:
+            last.complete.objects.discard(header.object)
+        shape = topology_checksum(topology)
+        complete = self._complete.setdefault(shape, CompleteFactors())
+        complete.objects.add(header.object)
+        self.objects[header.object] = AnnouncedObject(
+            header.epoch, 3 * topology.nodes, len(topology.columns) // 4, shape, complete
+        )
+        if not complete.largest:
+            self._unsized.add(header.object)
         self._most_blocks = max(known.blocks for known in self.objects.values())
 
     def add_pattern(self, key: object, data: Sized) -> tuple[str, FactorPattern] | None:
@@ -108,16 +167,18 @@ class FactorDecoder:
         ):
             if value != wanted:
                 raise Refused(f"Factor.{name} is {value!r}; allowed: {wanted!r}, as in the matrix", "malformed")
-        pattern = self.objects[job.object].patterns.get(message.pattern)
+        pattern = self.objects[job.object].pattern(message.pattern)
         if pattern is None:
             raise Refused(f"Factor.pattern is {message.pattern:016x}, which was not sent before", "pattern")
         if message.nonzeros != pattern.nonzeros:
             raise Refused(f"Factor.nonzeros is {message.nonzeros}; allowed: {pattern.nonzeros}", "shape")
         if fetch is not None:
             return self._factor(pattern, fetch(), None, job, message.seconds, message.remedy)
-        in_slot = message.HasField("slot")
-        values = _from_slot(message.slot, message.nonzeros, job) if in_slot else _from_payload(message, payload)
-        return self._factor(pattern, values, message.checksum, job, message.seconds, message.remedy)
+        if message.HasField("slot"):
+            values, seen = self._from_slot(message.slot, message.nonzeros, job)
+        else:
+            values, seen = _from_payload(message, payload), None
+        return self._factor(pattern, values, message.checksum, job, message.seconds, message.remedy, seen)
 
     def parse_batch(self, key: object, attachment: Sized | None) -> FactorBatch:
         """Parses a message with answers to several jobs. Each answer is checked by itself, in `decode_one`."""
@@ -140,14 +201,14 @@ class FactorDecoder:
         seconds, nonzeros = message.seconds[place], message.nonzeros[place]
         if not 0 <= seconds < math.inf:
             raise Refused(f"FactorBatch.seconds has {seconds}; allowed: finite, 0 or more", "malformed")
-        pattern = self.objects[job.object].patterns.get(message.patterns[place])
+        pattern = self.objects[job.object].pattern(message.patterns[place])
         if pattern is None:
             raise Refused(f"FactorBatch.patterns has {message.patterns[place]:016x}, which was not sent", "pattern")
         if nonzeros != pattern.nonzeros:
             raise Refused(f"FactorBatch.nonzeros has {nonzeros}; allowed: {pattern.nonzeros}", "shape")
-        values = _from_slot(message.slot, nonzeros, job)
+        values, seen = self._from_slot(message.slot, nonzeros, job)
         remedy = message.remedies[place] if message.remedies else ""
-        return self._factor(pattern, values, message.checksums[place], job, seconds, remedy)
+        return self._factor(pattern, values, message.checksums[place], job, seconds, remedy, seen)
 
     def decode_several(
         self, message: FactorBatch, answers: Sequence[tuple[int, InFlightJob]]
@@ -163,34 +224,46 @@ class FactorDecoder:
 
     def _factor(
         self, pattern: FactorPattern, values: Float32 | Float64, checksum: int | None, job: InFlightJob,
-        seconds: float, remedy: str,
+        seconds: float, remedy: str, seen: tuple[int, bool] | None = None,
     ) -> Factor:  # fmt: skip
-        check_values(values, pattern, checksum)
-        largest = self.objects[job.object].largest
-        largest[job.method] = max(largest.get(job.method, 0), pattern.nonzeros)
+        check_values(values, pattern, checksum, seen)
+        known = self.objects[job.object]
+        known.largest[job.method] = max(known.largest.get(job.method, 0), pattern.nonzeros)
         self._unsized.discard(job.object)
+        if job.method == COMPLETE and pattern.id not in known.complete.patterns:
+            self._share(known.complete, pattern)
         return Factor(job.object, job.epoch, job.step, job.warp, pattern, values, job.worker, seconds, remedy[:200])
+
+    def _share(self, complete: CompleteFactors, pattern: FactorPattern) -> None:
+        """Has all objects of a topology know the pattern of a complete factor of one of them."""
+        complete.largest = max(complete.largest, pattern.nonzeros)
+        kept = list(complete.patterns.items())[1 - MAX_PATTERNS :]
+        complete.patterns = {**dict(kept), pattern.id: pattern}  # replaced: another thread may read it
+        self._unsized = self._unsized - complete.objects
+
+    def _from_slot(
+        self, told: SlotMessage, nonzeros: int, job: InFlightJob
+    ) -> tuple[Float32 | Float64, tuple[int, bool]]:  # fmt: skip
+        """Copies the values out of the slot allocated for the job: they must not change any more once they are checked.
+        Returns them, their checksum, and whether all are finite."""
+        slot = job.factor_slot
+        if slot is None:
+            raise Refused("Factor.slot is set, but no slot was lent for this job", "slot")
+        given = (told.segment, told.offset, told.generation)
+        allocated = (slot.segment, slot.offset, job.factor_generation)
+        if given != allocated:
+            raise Refused(f"Factor.slot is {given}; allowed: {allocated}, as lent for this job", "slot")
+        size, room = nonzeros * np.dtype(job.dtype).itemsize, job.room or slot.capacity
+        if size > room:
+            raise Refused(f"Factor.nonzeros is {nonzeros}: {size} bytes in a slot of {room}", "slot")
+        values = (self.memory if size > LARGE else np.empty)(nonzeros, np.dtype(job.dtype))
+        return values, copied(slot.part(job.first, job.dtype, nonzeros), values, own=values)
 
     def _object(self, message: PatternMessage | FactorMessage, key: object, channel: str) -> AnnouncedObject:
         header = check_header(message, incarnation=self._incarnation, object=self.objects)
         if header.object != name_in(channel, key, "object"):
             raise Refused(f"{message.DESCRIPTOR.name}.header.object is {header.object!r}, its key is {key}", "object")
         return self.objects[header.object]
-
-
-def _from_slot(told: SlotMessage, nonzeros: int, job: InFlightJob) -> Float32 | Float64:
-    """Copies the values out of the slot allocated for the job: they must not change any more once they are checked."""
-    slot = job.factor_slot
-    if slot is None:
-        raise Refused("Factor.slot is set, but no slot was lent for this job", "slot")
-    given = (told.segment, told.offset, told.generation)
-    allocated = (slot.segment, slot.offset, job.factor_generation)
-    if given != allocated:
-        raise Refused(f"Factor.slot is {given}; allowed: {allocated}, as lent for this job", "slot")
-    size, room = nonzeros * np.dtype(job.dtype).itemsize, job.room or slot.capacity
-    if size > room:
-        raise Refused(f"Factor.nonzeros is {nonzeros}: {size} bytes in a slot of {room}", "slot")
-    return slot.part(job.first, job.dtype, nonzeros).copy()
 
 
 def _from_payload(message: FactorMessage, payload: Sized) -> Float32 | Float64:

@@ -186,7 +186,8 @@ class FactorIntake:
             job, fetch = self.decoding[number].job, self.decoding[number].fetch
             if fetch is not None and self._book.leases.by_object.get(job.object) is not job:
                 fetch.give_up()
-        for number in [number for number, each in self.decoding.items() if each.future.done()]:
+        done = {id(future) for future in {each.future for each in self.decoding.values()} if future.done()}
+        for number in [number for number, each in self.decoding.items() if id(each.future) in done]:
             each = self.decoding.pop(number)
             self._fetches.discard(number)
             try:

@@ -2,16 +2,22 @@
 """Sends jobs to workers: alone or in batches, with slots of shared memory for what fits."""
 
 import time
+from collections import deque
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache, partial
 
 import numpy as np
 import zenoh
 
 from protocol.channels import PART_BYTES, WHOLE_PARTS, key
 from protocol.counters import Counters
+from protocol.messages_pb2 import MatrixBatch
 from protocol.method import Method
+from protocol.shared_memory.limits import SLOT_SHARE
 from protocol.shared_memory.pool import Slot, SlotPool
-from sim_server.network.batch_message import MOST_TOGETHER, Entry, batch_message, entries_of, group
+from sim_server.arrays import Float64
+from sim_server.network.batch_message import MOST_TOGETHER, Entry, batch_message, entries_of, fill, group
 from sim_server.network.bookkeeping import Bookkeeping
 from sim_server.network.job_message import add_values, matrix_message
 from sim_server.network.leases import InFlightJob
@@ -22,8 +28,15 @@ from sim_server.updates.factor_source import Job
 FAST_SEND = 0.05  # s in which a fast link takes a job as bytes; zenoh drops what is not taken within 0.25 s
 BEHIND = 10.0  # s of a lease, at most, for what waits at a worker behind a first job, which has a longer one
 MAX_SENT = 4096  # times of jobs that are remembered
-SLOT_SHARE = 4  # a larger part of all shared memory than a SLOT_SHARE-th is not lent for one factor: it goes in parts
 SLOT_MARGIN = 8  # the slot for an incomplete factor is larger than the largest factor so far by a SLOT_MARGIN-th
+
+
+@dataclass
+class Filling:
+    """Slots of a batch that the thread of the queue fills and sends; `over` once it has."""
+
+    slots: tuple[Slot, Slot]
+    over: bool = False
 
 
 class JobSender:
@@ -40,6 +53,7 @@ class JobSender:
         self._pool, self._queue, self._counters = pool, queue, counters
         self._book, self._choice = book, choice
         self._sent: dict[int, float] = {}  # when the network took a job, by its number
+        self._filling: deque[Filling] = deque()  # oldest first
         self._fast_links: set[str] = set()  # workers without shared memory whose link takes a job at once
 
     def sent_at(self, job: InFlightJob) -> float:
@@ -55,6 +69,16 @@ class JobSender:
         if len(self._sent) > MAX_SENT:
             flying = {job.number for job in self._book.leases.jobs}
             self._sent = {number: when for number, when in self._sent.items() if number in flying}
+
+    def give_back_sent(self) -> None:
+        """Gives back slots that the thread of the queue needs no more: they are free once their jobs are over, too."""
+        while self._filling and self._filling[0].over:
+            self._give_back(self._filling.popleft().slots)
+
+    def _give_back(self, slots: Sequence[Slot]) -> None:
+        if self._pool is not None:
+            for slot in slots:
+                self._pool.give_back(slot)
 
     def submit(self, job: Job) -> bool:
         """Sends a job alone; False if no worker has room or the object has a job in flight."""
@@ -112,8 +136,8 @@ class JobSender:
 
     def _fits_batch(self, job: Job) -> bool:
         """True if the size of the factor is known: that of an incomplete one may grow."""
-        known = self._book.decoder.objects[job.object].largest
-        return not job.positions and job.method.name in known and job.method.name != "incomplete_cholesky"
+        sized = self._book.decoder.objects[job.object].most_values(job.method.name) > 0
+        return not job.positions and sized and job.method.name != "incomplete_cholesky"
 
     # ---- a batch ---------------------------------------------------------------------------------------------
 
@@ -131,24 +155,37 @@ class JobSender:
             for job, lease, entry in zip(jobs, seconds, entries, strict=True)
         ]
         message = batch_message(entries, in_flight, seconds, self._incarnation, *slots)
-        name, attachment = key("matrices", self._server, worker=worker), message.SerializeToString()
-        payload = slots[0].payload
-        if self._queue.post(lambda: self._put(in_flight, name, payload, attachment, True)):
+        filling, matrices = Filling(slots), [job.values for job in jobs]
+        if self._queue.post(partial(self._fill_and_put, message, matrices, in_flight, filling)):
+            self._filling.append(filling)
             self._on_sent(worker, jobs)
             return [True] * len(jobs)
         for job in in_flight:
             leases.cancel(job)
+        self._give_back(slots)
         return [False] * len(jobs)
+
+    def _fill_and_put(
+        self, message: MatrixBatch, matrices: Sequence[Float64], jobs: Sequence[InFlightJob], filling: Filling
+    ) -> None:  # fmt: skip
+        """Copies matrices and sends them, in the thread of the queue. The slots are not lent again meanwhile."""
+        slot, name = filling.slots[0], key("matrices", self._server, worker=message.worker)
+        try:
+            fill(message, matrices, slot)
+            self._put(jobs, name, slot.payload, message.SerializeToString(), True)
+        finally:
+            filling.over = True
 
     def _allocate_batch(self, entries: Sequence[Entry]) -> tuple[Slot, Slot] | None:
         """Allocates a slot for matrices and one for factors; None if there is not enough shared memory."""
         assert self._pool is not None
-        matrices = self._pool.lend(sum(entry.job.values.nbytes for entry in entries), len(entries))
-        factors = self._pool.lend(entries[-1].first + entries[-1].room, len(entries))
+        users = len(entries) + 1  # and the thread that sends them
+        matrices = self._pool.lend(sum(entry.job.values.nbytes for entry in entries), users)
+        factors = self._pool.lend(entries[-1].first + entries[-1].room, users)
         if matrices is not None and factors is not None:
             return matrices, factors
         for slot in filter(None, (matrices, factors)):
-            for _ in entries:
+            for _ in range(users):
                 self._pool.give_back(slot)
         return None
 
@@ -175,7 +212,7 @@ class JobSender:
         large one does while its slot is being made: the caller would wait for that as long as many rounds take."""
         if self._pool is None or not self._choice.has_slots(worker):
             return None, None
-        nonzeros = self._book.decoder.objects[job.object].largest.get(job.method.name, 0)
+        nonzeros = self._book.decoder.objects[job.object].most_values(job.method.name)
         if job.method.name == "incomplete_cholesky":
             nonzeros += nonzeros // SLOT_MARGIN  # the next factor may keep more blocks
         size = nonzeros * np.dtype(job.dtype).itemsize
@@ -201,7 +238,7 @@ class JobSender:
             job.epoch,
             job.step,
             job.warp,
-            np.dtype(job.dtype).name,
+            _dtype_name(job.dtype),
             worker,
             deadline=now + max(lease, min(leases.deadlines().get(worker, 0.0) - now, BEHIND)),
             factor_slot=factor_slot,
@@ -245,3 +282,8 @@ class JobSender:
             self._fast_links.add(worker)
         for job in jobs:
             self._sent[job.number] = self._book.clock()
+
+
+@cache
+def _dtype_name(dtype: str) -> str:
+    return np.dtype(dtype).name

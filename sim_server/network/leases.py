@@ -83,6 +83,7 @@ class Leases:
         self._doublings: dict[tuple[str, str], int] = {}  # of the lease, after expired jobs, by object and worker
         self._reassigned: set[int] = set()  # numbers of jobs whose object another worker may have
         self._deadlines: dict[str, float] | None = None  # None: to be reckoned anew
+        self._next_deadline = float("inf")  # no job in flight has an earlier one
         self._last = 0
 
     def next_number(self) -> int:
@@ -116,7 +117,9 @@ class Leases:
         """Adds a job that is being sent."""
         self.by_object[job.object] = job
         self.by_worker.setdefault(job.worker, {})[job.number] = job
-        self._deadlines = None
+        self._next_deadline = min(self._next_deadline, job.deadline)
+        if self._deadlines is not None:
+            self._deadlines[job.worker] = max(self._deadlines.get(job.worker, job.deadline), job.deadline)
 
     def cancel(self, job: InFlightJob) -> None:
         """Removes a job that was never sent."""
@@ -128,9 +131,11 @@ class Leases:
         """Removes a job from those of its worker."""
         jobs = self.by_worker.get(job.worker, {})
         jobs.pop(job.number, None)
-        self._deadlines = None
+        if self._deadlines is not None and job.deadline >= self._deadlines.get(job.worker, job.deadline):
+            self._deadlines = None  # the latest one may be another now
         if not jobs:
             self.by_worker.pop(job.worker, None)
+            self._deadlines = None
 
     def count(self, worker: str) -> int:
         """Number of jobs in flight at a worker."""
@@ -198,7 +203,12 @@ class Leases:
 
         is_answered: the answer is there, and is taken in
         """
-        return self._expire([job for job in self.jobs if now > job.deadline and not is_answered(job)])
+        if now <= self._next_deadline:
+            return []
+        over = [job for job in self.jobs if now > job.deadline and not is_answered(job)]
+        expired = self._expire(over)
+        self._next_deadline = min((job.deadline for job in self.jobs), default=float("inf"))
+        return expired
 
     def expire_undelivered(
         self, sent_at: Callable[[InFlightJob], float], idle: Callable[[str], tuple[float, float] | None]

@@ -34,13 +34,17 @@ class WorkerChoice:
         Several wait at a worker only where all objects are small and arrays are in shared memory, as many as it does
         within QUEUE_SECONDS: it then need not wait for the network after each, and may factorize them together.
         """
+        return max(0, self.most_waiting(worker) - self._waiting(worker))
+
+    def most_waiting(self, worker: str) -> int:
+        """Number of jobs that may be in flight at a worker."""
         info, seconds = self._book.registry.info(worker), self._book.timing.mean_factorization(worker)
         most = 1
         small = self._book.decoder.most_blocks <= SMALL_BLOCKS and self._shared
         if info is not None and info.shared_memory and seconds is not None and small:
             most = MOST_JOBS if info.batches and self._book.decoder.most_are_sized else MOST_ALONE
             most = max(1, min(info.most_jobs, most, int(QUEUE_SECONDS / max(seconds, 1e-6))))
-        return max(0, most - self._waiting(worker))
+        return most
 
     def rooms(self) -> dict[str, int]:
         """Room of each open worker."""
@@ -101,6 +105,8 @@ class WorkerChoice:
         """Number of busy workers that would finish one more job before the fastest idle one could."""
         now, book = self._book.clock(), self._book
         idle = [(name, now - book.free_since.get(name, 0.0)) for name in self.open()]
+        if len(idle) == len(book.available()):
+            return 0
         full = {name for name in book.leases.by_worker if not self.room(name)}
         busy = [(j.worker, j.object, now - j.sent_at) for j in book.leases.jobs if j.worker in full]
         return book.timing.faster_busy_workers(idle, busy)

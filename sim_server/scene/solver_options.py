@@ -106,7 +106,8 @@ class SolverOptions(Parameters):
     )
     factor_precision: FactorPrecision = Field(
         default="auto",
-        description="of the factor as applied; auto: float32 on a CPU and where it is used alone (ros2), else float16",
+        description="of the factor as applied; auto: float32 on a CPU, where it is used alone (ros2) and where it does "
+        "not bear float16, else float16",
     )
     budget: float = Field(default=0.0, ge=0, description="wall time per solve [s]; 0 = none")
     budget_ms: float | None = Field(default=None, gt=0, description="wall time per step [ms]")

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 from protocol import messages_pb2 as pb
 from sim_server.service.commands import Commands
 
-HALT_TIMEOUT = 1.0  # s that the answer to `pause` or `stop` waits for the end of the step under way, at most
-STEPS_TIMEOUT = 60.0  # s that the answer to `step` waits for its last step, at most
+HALT_TIMEOUT = 1.0  # s that the answer to `pause` waits for the end of the step under way, at most
+STEPS_TIMEOUT = 60.0  # s that the answer to `step` or `stop` waits for the last step, at most
 MAX_HALTS = 64  # answers that wait at a time
 
 Reply = Callable[[pb.Reply], None]
@@ -47,7 +47,8 @@ class Halts:
         elif command.verb == "step":
             self._steps.append(_Steps(time.monotonic() + STEPS_TIMEOUT, reply, answer, command.steps or 1))
         elif command.verb in ("pause", "stop") and not full:
-            self._waiting.append((time.monotonic() + HALT_TIMEOUT, reply, answer))
+            longest = HALT_TIMEOUT if command.verb == "pause" else STEPS_TIMEOUT
+            self._waiting.append((time.monotonic() + longest, reply, answer))
         else:
             return False
         return True
@@ -67,7 +68,7 @@ class Halts:
             halted = stands or not commands.engine_paused  # or it goes on already
             late = time.monotonic() >= until
             if (halted and answer.status.state == "paused") or ended or late:
-                if answer.status.state == "paused" and not (stands or ended):
+                if not (ended or (stands and answer.status.state == "paused")):
                     answer.status.state = "running"  # what it says is no more so, or not yet
                 self._send(reply, answer)
             else:

@@ -130,6 +130,8 @@ class Service:
         if not self.link.dispatch.workers():
             self._first = None  # nobody makes any
         loop = threading.Thread(target=self._loop, name="loop")
+        if self._loop_alone:
+            self._drain()  # asks for the matrices of the first step, and not of the one that is due dt later
         try:
             loop.start()  # inside: a signal may come before it returns, when the thread runs already
             while loop.is_alive() and not self.commands.stopping:

@@ -12,7 +12,7 @@ from protocol.method import Method
 from sim_server.backends.rosenbrock import FORMS
 from sim_server.mechanics.world import Body
 from sim_server.updates.autotune.preconditioner import PreconditionerTuner
-from sim_server.updates.stats import MEMORY, RunningMean, flops
+from sim_server.updates.stats import MEMORY, RunningMean, flops, updated
 from sim_server.updates.update_table import NONE, Cell, MeanCell, UpdateTable
 
 MAX_REMEMBERED = 32  # factors whose method and worker are remembered
@@ -38,7 +38,7 @@ class SolveStatistics:
     def __init__(self, table: UpdateTable, index: int):
         self._table, self._index = table, index
         self.iteration_cost = MeanCell(table.iteration_cost, index)
-        self.first_excess = RunningMean()
+        self.first_excess = MeanCell(table.first_excess, index)
 
     def add(self, excess: Iterable[float], factor_steps: Iterable[int], newest: int) -> None:
         """Adds solves, one after another.
@@ -68,7 +68,7 @@ class JobState:
     """The matrix that is being copied or factorized.
 
     copy: into which the loop copies the matrix or the positions requested
-    request: number of the request for that copy, among those of all bodies
+    request: number of the request for that copy, among those of all bodies; requested: when it was [s, monotonic]
     extrapolated: by how much the positions requested were extrapolated [s]
     sent: step of the last matrix that was sent; None: none was
     matrix: of the job in flight: step and what was sent
@@ -81,7 +81,7 @@ class JobState:
     def __init__(self, table: UpdateTable, index: int):
         self._table, self._index = table, index
         self._copy: NDArray[np.float64] | None = None
-        self.request, self.extrapolated, self.excess = 0, 0.0, 0.0
+        self.request, self.requested, self.extrapolated, self.excess = 0, 0.0, 0.0, 0.0
         self.matrix: tuple[int, NDArray[np.float64]] | None = None
         self.positions = False
 
@@ -173,11 +173,15 @@ class FactorStatistics:
     def add(self, factor: Factor, cost: float) -> None:
         """Adds a factor. cost: of its making."""
         self.cost.add(cost)
+        self.newest = factor.step
+        self.used += 1
+        self.note(factor, cost)
+
+    def note(self, factor: Factor, cost: float) -> None:
+        """Remembers of a factor what stands in no table."""
         if method := self.method(factor.step):
             self.cost_by_method.setdefault(method.name, RunningMean()).add(cost)
-        self.newest = factor.step
         _remember(self.workers, factor.step, factor.worker)
-        self.used += 1
         self.regularized += bool(factor.remedy)
 
 
@@ -289,10 +293,10 @@ def excess(records: Any, floor: int, error_bound: Any) -> Any:
     return np.where(alone, np.where(alone, records["estimate"], 0.0) / error_bound, above)
 
 
-def observe_steps(states: Sequence[BodyUpdateState], table: UpdateTable, r: NDArray[Any], floor: int) -> None:
+def observe_steps(table: UpdateTable, r: NDArray[Any], floor: int) -> None:
     """Takes note of whole steps, as BodyUpdateState.observe does of each record of (steps, bodies), in seconds.
 
-    table: that of the states. Bodies whose factor changed within these steps are looked at one by one.
+    table: that of the bodies
     """
     steps, factor = len(r), r["factor_step"]
     above = excess(r, floor, table.error_bound)
@@ -311,8 +315,57 @@ def observe_steps(states: Sequence[BodyUpdateState], table: UpdateTable, r: NDAr
     table.lost += np.where(made >= 0, total, 0.0)
     table.latest[same] = above[-1, same]
     outdated = one & (made >= 0) & (made < table.newest)  # a newer factor was taken up: these solves count no more
-    for k in np.flatnonzero(~same & ~outdated).tolist():
-        states[k].solves.add(above[:, k].tolist(), factor[:, k].tolist(), states[k].factors.newest)
+    changed = np.flatnonzero(~same & ~outdated)
+    if len(changed):
+        _add_changed(table, changed, above[:, changed], factor[:, changed])
+
+
+def _add_changed(table: UpdateTable, row: NDArray[np.int64], above: Any, factor: Any) -> None:
+    """Adds steps (steps, rows) within which factors changed, as SolveStatistics.add does of each body."""
+    total, latest, lost, last = (c[row] for c in (table.excess, table.latest, table.lost, table.factor_step))
+    for each, made in zip(above, factor, strict=True):
+        counted = (made < 0) | (made >= table.newest[row])
+        new = counted & (made >= 0) & (made != last)
+        _add(table.first_excess, row[new], each[new])
+        last, total, lost = np.where(new, made, last), np.where(new, 0.0, total), np.where(new, 0.0, lost)
+        lost += np.where(counted & (made >= 0), each, 0.0)
+        total += np.where(counted, each, 0.0)
+        latest = np.where(counted, each, latest)
+    table.excess[row], table.latest[row], table.lost[row], table.factor_step[row] = total, latest, lost, last
+
+
+def on_factors(
+    states: Sequence[BodyUpdateState], table: UpdateTable, factors: Sequence[Factor], step: int
+) -> list[bool]:  # fmt: skip
+    """Takes note of factors of different bodies, as BodyUpdateState.on_factor does of each, with costs in seconds.
+
+    table: that of the states. step: during which they came
+    """
+    row = np.array([state.body.index for state in states])
+    made = np.array([factor.step for factor in factors])
+    came = table.in_flight[row] & (made == table.sent[row])
+    _add(table.latency, row[came], np.maximum(1, step - made[came]))
+    table.in_flight[row], table.failures[row] = False, 0
+    newer = made > table.newest[row]
+    taken = row[newer]
+    _add(table.cost, taken, np.maximum([factor.seconds for factor in factors], MIN_SECONDS)[newer])
+    table.newest[taken] = made[newer]
+    table.used[taken] += 1
+    table.lost[taken] = 0.0
+    table.excess[taken] = table.latest[taken] = np.nan_to_num(table.first_excess[taken])
+    table.sent[taken] = np.where(table.sent[taken] == NONE, made[newer], table.sent[taken])
+    for state, factor, better in zip(states, factors, newer.tolist(), strict=True):
+        if state.job.positions:
+            state.failures.assemblies = 0
+        if better:
+            state.factors.note(factor, max(factor.seconds, MIN_SECONDS))
+    return list(newer.tolist())
+
+
+def _add(means: NDArray[np.float64], rows: NDArray[np.int64], values: NDArray[Any]) -> None:
+    """Adds a value to each of some running means, NaN where there was none."""
+    before = means[rows]
+    means[rows] = np.where(np.isnan(before), values, updated(before, values))
 
 
 def _remember(table: dict[int, Any], step: int, value: Any) -> None:

@@ -24,7 +24,7 @@ from sim_server.backends.base import Capability
 from sim_server.backends.cpu.structs import REACTION
 from sim_server.mechanics.world import Body
 from sim_server.simulation import Simulation
-from sim_server.updates.body_state import BodyUpdateState
+from sim_server.updates.body_state import BodyUpdateState, on_factors
 from sim_server.updates.factor_check import FactorCheck
 from sim_server.updates.factor_source import FactorSource, Inline, Job
 from sim_server.updates.patterns import Patterns
@@ -84,6 +84,7 @@ class Driver:
         if self.wants_factors:
             self.check.prepare()
             self.engine.prepare_for_factors()
+            self.source.use_memory(self.engine.factor_memory)
         self.reactions: Float64 = np.zeros((0, 0, 6))
         self.other_reactions: NDArray[Any] = np.zeros(0, REACTION)
         self.readings: Float64 = np.zeros((0, 0))
@@ -241,8 +242,16 @@ class Driver:
     def _check_beside(self, factors: Sequence[Factor]) -> None:
         held = [self.snapshots.hold(self.by_name[f.object], f.step) for f in factors]
         checked = [(factor, matrix) for factor, (_, matrix) in zip(factors, held, strict=True)]
-        reasons = self._checker.submit(self.check.reject_reasons, checked)
+        applied = self._prepare(factors[0]) if len(factors) == 1 else None
+        reasons = self._checker.submit(self.check.reject_reasons, checked, applied)
         self.checks.append(FactorsUnderCheck(factors, [memory for memory, _ in held], reasons))
+
+    def _prepare(self, factor: Factor) -> Callable[[], Float64 | None] | None:
+        """Has a large factor made ready for use while it is checked, and applied for the check."""
+        if self.check.wrong_size(factor):
+            return None
+        body = self.by_name[factor.object].body.index
+        return self.engine.prepare_factor(body, factor, self.check.vector(factor.object, factor.epoch))
 
     def _begin_checks(self) -> None:
         self._checker, self._process = ThreadPoolExecutor(1, "checks of factors"), os.getpid()
@@ -263,6 +272,7 @@ class Driver:
             good, reasons = [], []
             for factor, reason in zip(check.factors, check.reasons.result(), strict=True):
                 if self.source.epoch(factor.object) not in (None, factor.epoch):
+                    self.engine.drop_factor(self.by_name[factor.object].body.index, factor)
                     self.fail(factor.object, "it was of a mesh that was split since")
                     continue
                 good.append(factor)
@@ -272,17 +282,30 @@ class Driver:
 
     def _take_up(self, factors: Sequence[Factor], reasons: Sequence[str]) -> None:
         """Puts factors into the mailboxes of their bodies. reasons: why each is not to be used; empty if it is."""
-        posted: list[Factor] = []
+        good: list[Factor] = []
         for factor, why in zip(factors, reasons, strict=True):
             if why:
                 self.useless_factors.on_rejected(factor)
                 self.fail(factor.object, f"that of {factor.worker} is not used: {why}", refused=True)
-            elif self.by_name[factor.object].on_factor(factor, self.engine.step):  # else it is older than the newest
-                posted.append(factor)
+            else:
+                good.append(factor)
+        newer = self._on_factors(good)  # others are older than the newest
+        posted = [factor for factor, better in zip(good, newer, strict=True) if better]
+        used = {id(factor) for factor in posted}
+        for factor in factors:
+            if id(factor) not in used:
+                self.engine.drop_factor(self.by_name[factor.object].body.index, factor)
         bodies = [self.by_name[factor.object].body.index for factor in posted]
         self.engine.post_factors(bodies, posted)
         for factor in posted:
             self._tell(self.by_name[factor.object], factor)
+
+    def _on_factors(self, factors: Sequence[Factor]) -> list[bool]:
+        """Takes note of factors; returns which are newer than those of their bodies."""
+        states, step = [self.by_name[factor.object] for factor in factors], self.engine.step
+        if self.counted or len(factors) < MANY or len({factor.object for factor in factors}) < len(factors):
+            return [state.on_factor(factor, step) for state, factor in zip(states, factors, strict=True)]
+        return on_factors(states, self.table, factors, step)
 
     def _tell(self, state: BodyUpdateState, factor: Factor) -> None:
         """Tells observers, and `auto`, of a factor that the loop was given."""
@@ -294,11 +317,11 @@ class Driver:
             at_end = Capability.MATRIX_POSITIONS not in self.engine.capabilities
             later = state.job.positions and at_end and factor.worker != self.inline.WORKER
             name = method.name if method else factor.method
-            made = replace(
-                factor, ahead=state.job.extrapolated or factor.ahead, later=later or factor.later, method=name
-            )
+            ahead, later = state.job.extrapolated or factor.ahead, later or factor.later
+            if (ahead, later, name) != (factor.ahead, factor.later, factor.method):
+                factor = replace(factor, ahead=ahead, later=later, method=name)
             for observe in self.on_adopt:
-                observe(made)
+                observe(factor)
         # Let `auto` try it
         if state.tuner is not None:
             state.tuner.on_factor(method)

@@ -8,7 +8,7 @@ all of it; a factor that takes off less than block Jacobi does is worth less tha
 
 import ctypes as c
 import threading
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import cache
 from typing import NamedTuple
 
@@ -46,7 +46,7 @@ class Probe(NamedTuple):
 @cache
 def _library() -> c.CDLL:
     p = c.c_void_p
-    arguments = [c.c_int32, c.POINTER(structs.Factor), p, p, p, p, p, p, p]
+    arguments = [c.c_int32, c.POINTER(structs.Factor), p, p, p, p, p, p, p, p]
     library = native("backends/cpu/native/factor_check.cpp", {"wf_judge_all": (None, arguments)}, stepping=False)
     structs.LOOP.check_sizes(library)
     return library
@@ -86,19 +86,28 @@ class FactorCheck:
         """Compiles the native check, so that the first factor does not wait for it."""
         _library()
 
-    def reject_reasons(self, checked: Sequence[tuple[Factor, Reals | None]]) -> list[str]:
+    def vector(self, name: str, epoch: int) -> Reals:
+        """Returns the probe vector r of an object, for who applies a factor in place of this check."""
+        return self._vector(3 * (len(self._patterns.at(name, epoch)[0]) - 1))
+
+    def reject_reasons(
+        self, checked: Sequence[tuple[Factor, Reals | None]], applied: Callable[[], Reals | None] | None = None
+    ) -> list[str]:  # fmt: skip
         """Returns why each of some factors is not to be used; empty if it is. From any thread: native code is called
         once, without Python's lock.
 
         checked: factors, each with the values (blocks, 3, 3) that it was made from; None: not known, and the test
             against block Jacobi is left out
+        applied: returns z = P^-1 r of the one factor, once who applies it beside this has it; None: nobody has
         """
-        reasons = [self._wrong_size(factor) for factor, _ in checked]
+        reasons = [self.wrong_size(factor) for factor, _ in checked]
         fitting = [each for each, reason in zip(checked, reasons, strict=True) if not reason]
-        probes = iter(self.probe_all(fitting))
+        z = applied() if applied is not None else None
+        probes = iter(self.probe_all(fitting, z))
         return [reason or self._useless(*each, next(probes)) for each, reason in zip(checked, reasons, strict=True)]
 
-    def _wrong_size(self, factor: Factor) -> str:
+    def wrong_size(self, factor: Factor) -> str:
+        """Returns why a factor is not of the size of its object; empty if it is."""
         nodes = len(self._patterns.at(factor.object, factor.epoch)[0]) - 1
         if factor.pattern.size != 3 * nodes:
             return f"its size is {factor.pattern.size}, that of the object {3 * nodes}"
@@ -125,31 +134,34 @@ class FactorCheck:
         """Applies a factor, which has the right size, to the probe vector r. From any thread."""
         return self.probe_all([(factor, matrix)])[0]
 
-    def probe_all(self, checked: Sequence[tuple[Factor, Reals | None]]) -> list[Probe]:
-        """Applies factors, each of which has the right size, to the probe vector r. From any thread."""
+    def probe_all(self, checked: Sequence[tuple[Factor, Reals | None]], applied: Reals | None = None) -> list[Probe]:
+        """Applies factors, each of which has the right size, to the probe vector r. From any thread. applied: P^-1 r of
+        the only one, which has been applied already."""
         if not checked:
             return []
         with self._lock:
-            return self._probe_all(checked)
+            return self._probe_all(checked, applied)
 
-    def _probe_all(self, checked: Sequence[tuple[Factor, Reals | None]]) -> list[Probe]:
+    def _probe_all(self, checked: Sequence[tuple[Factor, Reals | None]], applied: Reals | None) -> list[Probe]:
         count = len(checked)
         factors, kept = (structs.Factor * count)(), []  # what is kept must live until the native code is done
-        nodes, pointers = np.zeros(count, np.int32), np.zeros((4, count), np.uintp)
+        nodes, pointers = np.zeros(count, np.int32), np.zeros((5, count), np.uintp)
         for i, (factor, matrix) in enumerate(checked):
             body, values = self._body(factor), np.ascontiguousarray(factor.values)
             factors[i].pattern, factors[i].values = c.addressof(body.factor_pattern.native), values.ctypes.data
             factors[i].step, factors[i].bytes = factor.step, values.itemsize
             nodes[i] = len(body.row_start) - 1
-            pointers[:, i] = *body.addresses, 0 if matrix is None else matrix.ctypes.data
+            pointers[:4, i] = *body.addresses, 0 if matrix is None else matrix.ctypes.data
+            pointers[4, i] = 0 if applied is None else applied.ctypes.data
             kept.append((body, values))
         if (needed := WORK * 3 * int(nodes.max())) > len(self._work):
             self._work = np.empty(needed)
         out = np.zeros((count, 5))
-        row_start, columns, r, matrices = (each.ctypes.data for each in pointers)
+        row_start, columns, r, matrices, z = (each.ctypes.data for each in pointers)
         _library().wf_judge_all(
-            count, factors, nodes.ctypes.data, row_start, columns, matrices, r, self._work.ctypes.data, out.ctypes.data
-        )
+            count, factors, nodes.ctypes.data, row_start, columns, matrices, r, z, self._work.ctypes.data,
+            out.ctypes.data,
+        )  # fmt: skip
         za = np.where(out[:, [1, 3]] > 0, out[:, [1, 3]], np.inf)
         energy = out[:, [0, 2]] ** 2 / za
         return [Probe(*row) for row in np.column_stack([out[:, 0], energy, out[:, 4]]).tolist()]
@@ -158,9 +170,11 @@ class FactorCheck:
         row_start, columns = self._patterns.at(factor.object, factor.epoch)
         known = self._bodies.get(factor.object)
         if known is None or not known.fits(row_start, columns, factor.pattern):
-            size = 3 * (len(row_start) - 1)
-            if size not in self._vectors:
-                self._vectors[size] = np.random.default_rng(0).standard_normal(size)
-            known = CheckedBody(row_start, columns, self._vectors[size], factor.pattern)
+            known = CheckedBody(row_start, columns, self._vector(3 * (len(row_start) - 1)), factor.pattern)
             self._bodies[factor.object] = known
         return known
+
+    def _vector(self, size: int) -> Reals:
+        if size not in self._vectors:
+            self._vectors[size] = np.random.default_rng(0).standard_normal(size)
+        return self._vectors[size]

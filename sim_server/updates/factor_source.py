@@ -4,11 +4,12 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
 from protocol.factor import Factor, FactorPattern
 from protocol.method import Method
@@ -19,6 +20,7 @@ if TYPE_CHECKING:
     from precond_worker.factorization.registry import Factorization
 
 EXACT = Method()
+FactorMemory = Callable[[int, np.dtype[Any]], NDArray[Any]]
 
 
 @dataclass(frozen=True)
@@ -26,7 +28,7 @@ class Job:
     """A matrix to factorize.
 
     values: float64, blocks of the matrix (blocks, 3, 3), or positions (nodes, 3) [m] from which the worker assembles
-        it; read during `submit` only
+        it; read during `submit`, or until the job is over
     warp: the matrix is in the material frame
     dtype, method: of the factor to be made
     """
@@ -76,9 +78,17 @@ class FactorSource(Protocol):
         """Returns (object, pattern) of the factors that will come, as far as it is new since the last call."""
         return []
 
+    def use_memory(self, memory: FactorMemory) -> None:
+        """Has large factors that arrive put into arrays that `memory` makes, of their number of values and type."""
+        return
+
     def worker_count(self) -> int:
         """Number of workers that may be given jobs, idle or busy."""
         return 1
+
+    def queues_jobs(self) -> bool:
+        """True if workers have several jobs at a time, so that none waits for the next one to travel."""
+        return False
 
     def epoch(self, name: str) -> int | None:
         """Returns the epoch of an object whose jobs it takes; None: of all."""

@@ -88,8 +88,10 @@ class FirstFactors:
             elif failed > self._failures.get(name, failed):
                 del self._failures[name]
         unsent = [state for name, state in self._waiting.items() if name not in self._failures]
-        for state in sorted(unsent, key=lambda state: state.body.first - state.body.last)[: source.ready()]:
-            if source.submit(driver.assembled_job(state)):
+        chosen = sorted(unsent, key=lambda state: state.body.first - state.body.last)[: source.ready()]
+        sent = source.submit_many([driver.assembled_job(state) for state in chosen])
+        for state, taken in zip(chosen, sent, strict=True):
+            if taken:
                 self._failures[state.body.name] = state.failures.in_a_row
 
     def _leave(self, state: BodyUpdateState) -> None:

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""How many matrices are copied ahead, where workers factorize many of them within one step.
+"""How many matrices are copied ahead, where workers factorize many of them before a copy is there.
 
-The loop copies a matrix as it assembles it, once a step. If only as many were requested as there are idle workers, each
-of them would get one job a step: with a thousand small bodies, whose step takes a second, it would rest for most of it.
+The loop copies a matrix as it assembles it, once a step, and a GPU brings it to the host some steps later. If only as
+many were requested as there are idle workers, these would rest meanwhile: with a thousand small bodies, for most of the
+time.
 """
 
 import numpy as np
@@ -11,15 +12,25 @@ from sim_server.arrays import Float64
 from sim_server.updates.stats import RunningMean
 
 MAX_DEPTH = 256  # matrices held at once
+MAX_WAIT = 2  # steps that a copied matrix may wait for a worker, and those that a copy takes beyond one
+WINDOW = 0.05  # s over which matrices that are sent are counted
+MORE = 1.5  # copies that are begun over those that are sent meanwhile
 TRANSFER = 1e-3  # s of a job beside the factorization, about
 
 
 class PrefetchDepth:
-    """Number of matrices that workers can factorize within one step: 0 where a factorization takes longer than that."""
+    """Number of matrices that workers can factorize within one step, or until a copy is there if that takes longer: 0
+    where a factorization takes longer than that.
+
+    patience: steps that a copy may wait for a worker
+    """
 
     def __init__(self) -> None:
-        self.depth = 0
+        self.depth, self.patience = 0, MAX_WAIT
         self._period = RunningMean()  # s from step to step
+        self._copy = RunningMean()  # s from the request of a copy until it is there
+        self._rate = RunningMean()  # matrices that were sent in a second
+        self._sent, self._since = 0, 0.0
         self._last: tuple[int, float] | None = None
 
     def on_step(self, step: int, now: float) -> bool:
@@ -31,11 +42,30 @@ class PrefetchDepth:
         self._last = step, now
         return True
 
-    def update(self, seconds: Float64, workers: int) -> None:
-        """Computes the depth. seconds: of a factorization of each body, NaN: not known yet."""
+    def on_copy(self, seconds: float) -> None:
+        """Takes note of a copy that is there so many seconds after its request."""
+        self._copy.add(seconds)
+
+    def on_sent(self, count: int, now: float) -> None:
+        """Takes note of matrices that were sent at the time `now` [s], or of none."""
+        self._sent += count
+        if (lasted := now - self._since) > WINDOW:
+            self._rate.add(self._sent / lasted)
+            self._sent, self._since = 0, now
+
+    def update(self, seconds: Float64, workers: int, queued: bool = False) -> None:
+        """Computes the depth.
+
+        seconds: of a factorization of each body, NaN: not known yet
+        queued: several jobs wait at each worker, for which their transfer then takes no time. A few more copies are
+            begun then than are sent in the time that they take
+        """
         known = seconds[~np.isnan(seconds)]
-        if len(known) and self._period.value is not None:
-            service = float(known.mean()) + TRANSFER
-            self.depth = min(int(workers * self._period.value / service), MAX_DEPTH)
-        else:
-            self.depth = 0
+        self.depth, period = 0, self._period.value
+        if len(known) and period is not None:
+            ahead, mean = max(period, self._copy.value or 0.0), float(known.mean())
+            depth = workers * period / (mean + TRANSFER)
+            if queued and self._rate.value is not None:
+                depth = max(depth, min(workers * ahead / mean, MORE * self._rate.value * ahead))
+            self.depth = min(int(depth), MAX_DEPTH)
+            self.patience = MAX_WAIT + int(ahead / period) - 1 if period > 0 else MAX_WAIT

@@ -5,6 +5,7 @@ The loop copies as it assembles, into memory that it is given here. A copy that 
 which is checked with it; then its memory is used again, so that in the long run none is added.
 """
 
+import time
 from collections.abc import Callable
 from itertools import count
 
@@ -37,7 +38,7 @@ class SnapshotPool:
     def request(self, state: BodyUpdateState) -> None:
         """Asks the loop to copy when it assembles next: the matrix, or the positions if they suffice."""
         engine, body, job = self._simulation.engine, state.body, state.job
-        job.request = next(self._requests)
+        job.request, job.requested = next(self._requests), time.monotonic()
         self._requested[body.index] = state
         if self._workers_assemble(state):
             job.copy = self._allocate((body.last - body.first, 3))

@@ -64,7 +64,7 @@ class SolveObserver:
     def _observe_steps(self, r: NDArray[Any]) -> None:
         """Sums up whole steps, (steps, bodies): where bodies are many, their factors wait for this function."""
         driver, states = self._driver, self._driver.bodies
-        observe_steps(states, driver.table, r, driver.solver.update_floor_iterations)
+        observe_steps(driver.table, r, driver.solver.update_floor_iterations)
         if not self._tuned:
             return
         shortfall, used = convergence(r, driver.solver, self._position)

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: MIT
 """Running means, and the cost of a factorization in operations."""
 
+from typing import Any
+
 import numpy as np
 
 from protocol.factor import FactorPattern
@@ -8,8 +10,8 @@ from protocol.factor import FactorPattern
 MEMORY = 0.2  # weight of the newest value in a running mean
 
 
-def updated(mean: float, value: float) -> float:
-    """The exponential running mean after one more value."""
+def updated(mean: Any, value: Any) -> Any:
+    """The exponential running mean after one more value; also of arrays."""
     return mean + MEMORY * (value - mean)
 
 

@@ -16,7 +16,7 @@ NONE = -1  # of a step: there is none
 class UpdateTable:
     """A row for each body. Means are NaN while they are not known, steps NONE.
 
-    excess, latest, lost, factor_step, max_factor_age, iteration_cost: as in SolveStatistics
+    excess, latest, lost, factor_step, max_factor_age, iteration_cost, first_excess: as in SolveStatistics
     refused, failures: as `refused`, `in_a_row` in FailureState
     newest, latency, cost, used: as in FactorStatistics; dropped: the newest factor is useless
     sent, in_flight: as in JobState; copying: a copy is requested, or waits to be sent
@@ -36,6 +36,7 @@ class UpdateTable:
         self.excess, self.latest, self.lost = zeros(), zeros(), zeros()
         self.factor_step, self.max_factor_age, self.newest, self.sent = steps(), steps(), steps(), steps()
         self.iteration_cost, self.latency, self.cost = unknown(), unknown(), unknown()
+        self.first_excess = unknown()
         self.refused, self.failures, self.used = (np.zeros(bodies, np.int64) for _ in range(3))
         self.error_bound = np.full(bodies, np.inf)
         self.dropped, self.in_flight, self.copying, self.frozen = (np.zeros(bodies, np.bool_) for _ in range(4))

@@ -10,6 +10,7 @@ from __future__ import annotations
 from enum import Enum, auto
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 from numpy.typing import NDArray
 
 from protocol.factor import Factor
@@ -73,15 +74,19 @@ class UselessFactors:
 
     def observe(self, records: NDArray[Any]) -> None:
         """Takes note of solves. It costs nothing while none of them abandons its factor."""
-        if not self._driver.policy.renews or not (self._suspects or records["fallbacks"].any()):
+        abandoned = records["fallbacks"] > 0
+        if not self._driver.policy.renews or not (self._suspects or abandoned.any()):
             return
-        for r in records:
-            state, abandoned, step = self._driver.bodies[r["body"]], bool(r["fallbacks"]), int(r["factor_step"])
+        suspected = np.zeros(len(self._counters), np.bool_)
+        suspected[list(self._suspects)] = True
+        suspected[records["body"][abandoned]] = True
+        for r in records[suspected[records["body"]]]:
+            state, left, step = self._driver.bodies[r["body"]], bool(r["fallbacks"]), int(r["factor_step"])
             index = state.body.index
-            if step < 0 or not (abandoned or index in self._suspects):
+            if step < 0 or not (left or index in self._suspects):
                 continue
             self._suspects.add(index)
-            verdict = self._counters[index].observe(step, abandoned, r["kind"] == Kind.CHOLESKY)
+            verdict = self._counters[index].observe(step, left, r["kind"] == Kind.CHOLESKY)
             if verdict is Verdict.USELESS:
                 self._found_useless(state, step)
             elif verdict is Verdict.USEFUL:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from sim_server.backends.compiler import INCLUDE, SOURCES, compiler
 from sim_server.backends.gpu import structs
-from sim_server.backends.gpu.loop import CAPACITY, MANY, DeviceLoop
+from sim_server.backends.gpu.loop import CAPACITY, GRAPH_STEPS, DeviceLoop
 from sim_server.backends.gpu.solver import PCG_RESULT
 from sim_server.backends.gpu.structs import ENERGY_RECORD, RECORDS, STEP_RECORDS, STEP_TIMESTAMP
 
@@ -28,8 +28,8 @@ SIGNATURES = {
 Work = Callable[[], None]
 
 ELASTIC_GRAPH, BALANCE_GRAPH, RECORD_GRAPHS = 11, 12, (15, 16)  # handles of graphs
-STEPS = {7: 1, 8: MANY, 9: 1, 10: MANY}  # of the graphs that step
-TIMED = (9, 10)  # those that note the time first
+STEPS = dict(zip(range(5, 11), GRAPH_STEPS * 2, strict=True))  # of the graphs that step
+TIMED = (8, 9, 10)  # those that note the time first
 
 
 class FakeDevice:

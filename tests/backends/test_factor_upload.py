@@ -5,6 +5,7 @@ import logging
 import threading
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
+from itertools import count
 from types import SimpleNamespace
 from typing import Any, NamedTuple
 
@@ -45,16 +46,24 @@ class Maker:
         self.bodies = np.zeros(1, [("setting", "i8"), ("factor", "i8")])
         self.storages: list[list[int]] = []
         self.events: list[Event] = []
+        self.limits: list[int | None] = []  # multiprocessors of each build
         self.fail: Exception | None = None
         self.thread = ThreadPoolExecutor(1)
-        self.planning: list[Future] | None = None  # plans that are not made yet; None: each is made at once
+        self.fine: set[int] = set()  # values whose inverses need 22 binary digits
+        self.planes_used: list[int] = []
+        self.planning: list[Future] | None = None  # plans that are not made yet; None: it is made
+        self.planned: Future = Future()
+        self.planned.set_result(SimpleNamespace(builder=self, plan=None))
 
-    def begin_plan(self, body: int, pattern: SimpleNamespace) -> Future:
+    def planes_for(self, pattern: SimpleNamespace, values: np.ndarray) -> int:
+        return 2 if values[0] in self.fine else 1
+
+    def begin_plan(self, body: int, pattern: SimpleNamespace, planes: int) -> Future:
+        if self.planning is None and not isinstance(self.fail, ValueError):
+            return self.planned
         made: Future = Future()
         if isinstance(self.fail, ValueError):
             made.set_exception(self.fail)
-        elif self.planning is None:
-            made.set_result(SimpleNamespace(builder=self))
         else:
             self.planning.append(made)
         return made
@@ -66,20 +75,36 @@ class Maker:
         self.storages.append([])
         return self.storages[-1]
 
-    spared = None
+    spared, planes = 8, None
+    most = 3  # inverses that are built together
 
-    def build(self, values: np.ndarray, storage: list[int], multiprocessors: int | None = None) -> PartitionedInverse:
+    def build_many(
+        self, values: list[np.ndarray], storages: list[list[int]], multiprocessors: int | None
+    ) -> list[PartitionedInverse]:
         if self.fail:
             raise self.fail
-        storage[:] = [int(values[0])]
+        assert 0 < len(values) == len(storages) <= self.most
+        self.limits.append(multiprocessors)
         self.events.append(Event(self.scene))
-        return PartitionedInverse(storage, self.events[-1])
+        for each, storage in zip(values, storages, strict=True):
+            storage[:] = [int(each[0])]
+        return [PartitionedInverse(storage, self.events[-1]) for storage in storages]
 
-    def forget_plans(self, patterns: set[int]) -> None:
-        self.known = patterns
+    def reserve_vectors(self, body: int, plan: Any) -> None:
+        return
 
-    def use(self, body: int, pattern: SimpleNamespace, inverse: PartitionedInverse, step: int) -> None:
+    def apply(self, inverse: PartitionedInverse, r: np.ndarray, multiprocessors: int | None = None) -> np.ndarray:
+        """In place of a factor the number that it is."""
+        return r / inverse.storage[0]
+
+    def forget_plans(self, kept: set[tuple[int, int]]) -> None:
+        self.known = kept
+
+    def use(
+        self, body: int, pattern: SimpleNamespace, inverse: PartitionedInverse, planes: int, step: int
+    ) -> None:  # fmt: skip
         self.bodies["factor"] = inverse.storage[0]
+        self.planes_used.append(planes)
 
 
 PATTERN = SimpleNamespace(id=1)
@@ -118,6 +143,15 @@ def test_a_factor_is_used_when_it_is_made(parts):
     scene.loop.run(1)
     assert upload.step(0) == 5
     assert used(scene) == [0, 5]
+
+
+@pytest.mark.parametrize(("realtime", "seconds", "limit"), [(1, 1e-4, None), (1, 0.9, 8), (0, 1e-4, 8), (1, 0.0, 8)])
+def test_builds_have_the_whole_device_where_steps_in_real_time_leave_it_idle(parts, realtime, seconds, limit):
+    """seconds: of a step; 0: not known yet."""
+    scene, maker, upload = parts
+    scene.loop.loop.realtime, scene.loop.loop.step_seconds, scene.loop.loop.dt = realtime, seconds, 1.0
+    post(upload, 5)
+    assert maker.limits == [limit]
 
 
 def test_what_comes_too_early_waits_and_the_newest_wins(parts):
@@ -176,7 +210,7 @@ def test_nobody_waits_for_a_plan_and_the_newest_factor_wins(parts):
     scene.loop.run(1)  # goes without
     assert len(plans) == 1 and maker.storages == [] and upload.step(0) == -1
     maker.planning = None
-    plans[0].set_result(SimpleNamespace(builder=maker))
+    plans[0].set_result(SimpleNamespace(builder=maker, plan=None))
     upload.settle()  # the first one is withdrawn, since another waits
     scene.loop.run(1)
     assert used(scene) == [0, 7] and upload.step(0) == 7
@@ -201,14 +235,14 @@ def test_large_factors_are_built_beside_the_caller(parts, monkeypatch):
     scene, maker, upload = parts
     monkeypatch.setattr(module, "SMALL", 0)
     begun, callers = threading.Event(), []
-    build = maker.build
+    build = maker.build_many
 
-    def slow(*arguments: Any) -> PartitionedInverse:
+    def slow(*arguments: Any) -> list[PartitionedInverse]:
         callers.append(threading.current_thread())
         begun.wait(30)
         return build(*arguments)
 
-    maker.build = slow
+    maker.build_many = slow
     post(upload, 5)
     post(upload, 6)
     assert upload.step(0) == -1 and maker.storages in ([], [[]])  # it is under way
@@ -218,6 +252,102 @@ def test_large_factors_are_built_beside_the_caller(parts, monkeypatch):
     assert used(scene) == [6] and threading.current_thread() not in callers
 
 
+R = np.ones(3)
+
+
+def prepared(upload: FactorUpload, value: int) -> tuple[np.ndarray, Future]:
+    values = np.array([value])
+    return values, upload.prepare(0, PATTERN, values, value, R)
+
+
+def test_a_prepared_factor_is_built_and_applied_and_used_once_it_is_posted(parts):
+    scene, maker, upload = parts
+    values, applied = prepared(upload, 5)
+    np.testing.assert_array_equal(applied.result(30), R / 5)
+    maker.thread.submit(lambda: None).result()
+    maker.events[0].synchronize()
+    upload.advance()
+    scene.loop.run(2)
+    assert upload.step(0) == -1, "nobody has posted it"
+    upload.post(0, PATTERN, values, 5)
+    scene.loop.run(1)
+    assert upload.step(0) == 5 and len(maker.storages) == 1 and used(scene) == [0, 0, 5]
+
+
+def test_what_is_posted_before_it_is_built_is_used_then(parts):
+    scene, maker, upload = parts
+    go, build = threading.Event(), maker.build_many
+
+    def slow(*arguments: Any) -> PartitionedInverse:
+        assert go.wait(30)
+        return build(*arguments)
+
+    maker.build_many = slow
+    values, _ = prepared(upload, 5)
+    upload.post(0, PATTERN, values, 5)
+    go.set()
+    upload.settle()
+    scene.loop.run(1)
+    assert used(scene) == [5] and len(maker.events) == 1
+
+
+@pytest.mark.parametrize("late", [False, True])
+def test_a_dropped_factor_is_never_used_and_leaves_its_storage(parts, late):
+    scene, maker, upload = parts
+    post(upload, 4)
+    upload.settle()
+    scene.loop.run(1)
+    for value in (5, 6, 7):
+        values, applied = prepared(upload, value)
+        if late:
+            applied.result(30)
+            maker.thread.submit(lambda: None).result()
+            upload.advance()
+        upload.drop(0, np.array([value]))  # equal, but not the same: another factor
+        upload.drop(0, values)
+        assert applied.done() or not late
+        maker.thread.submit(lambda: None).result()
+        upload.advance()
+        scene.loop.run(1)
+    post(upload, 8)
+    upload.settle()
+    scene.loop.run(1)
+    assert used(scene) == [4, 4, 4, 4, 8] and len(maker.storages) == 2
+
+
+def test_a_newer_factor_takes_the_place_of_a_prepared_one_and_its_check_is_told(parts):
+    scene, maker, upload = parts
+    _, applied = prepared(upload, 5)
+    applied.result(30)
+    maker.thread.submit(lambda: None).result()
+    upload.advance()
+    post(upload, 6)
+    upload.settle()
+    scene.loop.run(1)
+    assert used(scene) == [6]
+    post(upload, 7)
+    post(upload, 8)  # waits for the loop
+    _, waiting = prepared(upload, 9)
+    prepared(upload, 10)
+    assert waiting.result(0) is None
+
+
+def test_who_checks_is_told_that_nothing_can_be_built(parts, caplog):
+    scene, maker, upload = parts
+    maker.fail = NoMemory("none")
+    values, applied = prepared(upload, 5)
+    assert applied.result(30) is None
+    maker.thread.submit(lambda: None).result()
+    maker.fail = None
+    with caplog.at_level(logging.WARNING):
+        upload.advance()
+    assert "not enough GPU memory" in caplog.text
+    upload.post(0, PATTERN, values, 5)
+    upload.settle()
+    scene.loop.run(1)
+    assert used(scene) == [5]
+
+
 def test_plans_are_kept_of_the_last_two_patterns_alone(parts):
     """Each split of an object makes another one."""
     scene, maker, upload = parts
@@ -225,7 +355,53 @@ def test_plans_are_kept_of_the_last_two_patterns_alone(parts):
         upload.post(0, SimpleNamespace(id=number), np.array([number]), 0)
         upload.settle()
         scene.loop.run(1)
-        assert maker.known == {*range(max(1, number - 1), number + 1)}
+        assert maker.known == {(n, 1) for n in range(max(1, number - 1), number + 1)}
+
+
+def test_each_inverse_has_as_many_digits_as_its_factor_needs(parts, caplog):
+    """Two storages of each kind are reused; what changes is logged."""
+    scene, maker, upload = parts
+    maker.fine = {7, 8, 11}
+    with caplog.at_level(logging.INFO):
+        for value in range(5, 12):
+            post(upload, value)
+            upload.settle()
+            scene.loop.run(1)
+    assert maker.planes_used == [1, 1, 2, 2, 1, 1, 2]
+    assert used(scene) == list(range(5, 12))
+    assert len(maker.storages) == 4 and maker.known == {(PATTERN.id, 1), (PATTERN.id, 2)}
+    assert [
+        f"{digits} binary digits" in each.message for each, digits in zip(caplog.records, (22, 11, 22), strict=True)
+    ]
+
+
+@pytest.mark.parametrize("waits", [False, True])
+@pytest.mark.parametrize("prepare", [False, True])
+def test_a_large_factor_is_looked_at_and_built_beside_the_caller(parts, monkeypatch, prepare, waits):
+    """Where its plan is not made yet it is built behind that. prepare: before it is posted"""
+    scene, maker, upload = parts
+    monkeypatch.setattr(module, "SMALL", 0)
+    maker.fine, threads = {5}, []
+    choose = maker.planes_for
+
+    def seen(*arguments: Any) -> int:
+        threads.append(threading.current_thread())
+        return choose(*arguments)
+
+    def queued(body: int, pattern: SimpleNamespace, planes: int) -> Future:
+        return maker.thread.submit(lambda: SimpleNamespace(builder=maker, plan=None))
+
+    maker.planes_for = seen
+    if waits:
+        maker.begin_plan = queued
+    values = np.array([5])
+    if prepare:
+        np.testing.assert_array_equal(upload.prepare(0, PATTERN, values, 5, R).result(30), R / 5)
+    upload.post(0, PATTERN, values, 5)
+    upload.settle()
+    scene.loop.run(1)
+    assert used(scene) == [5] and maker.planes_used == [2] and len(maker.events) == 1
+    assert threads and threading.current_thread() not in threads
 
 
 def test_settled_means_used_by_the_next_step_even_if_others_wait(parts):
@@ -285,28 +461,30 @@ class Mailbox:
 
     taken, posted = False, 0
 
-    def post(self, data: bytes, keep: Any = None, event: int | None = None) -> None:
+    def post(self, data: bytes, keep: Any = None, event: int | None = None) -> SimpleNamespace:
         self.taken, self.posted = False, keep.step
+        return SimpleNamespace(taken=0)
 
 
 def test_many_are_built_beside_the_caller(many):
     """Who posts them waits for no build; each goes into the mailbox of its body once it is looked at again."""
     maker, upload, boxes = many
-    go, build = threading.Event(), maker.build
+    go, build = threading.Event(), maker.build_many
 
-    def slow(*arguments: Any) -> PartitionedInverse:
+    def slow(*arguments: Any) -> list[PartitionedInverse]:
         assert go.wait(30)
         return build(*arguments)
 
-    maker.build = slow
+    maker.build_many = slow
     values = list(range(1, len(boxes) + 1))
+    assert len(values) == maker.most + 1
     post_all(upload, values)
     upload.advance()
     assert [box.posted for box in boxes] == [0] * len(boxes), "none is built yet"
     go.set()
     maker.thread.submit(lambda: None).result()
     upload.advance()
-    assert [box.posted for box in boxes] == values
+    assert [box.posted for box in boxes] == values and len(maker.events) == 2, "as many at a time as the builder takes"
     post_all(upload, [v + 10 for v in values])  # the mail waits: these do, too
     assert len(maker.storages) == len(boxes)
     for box in boxes:
@@ -325,14 +503,14 @@ def test_few_are_built_at_once(many):
 
 def test_one_of_many_that_cannot_be_used_is_told_alone(many, caplog):
     maker, upload, boxes = many
-    build = maker.build
+    storage, asked = maker.storage, count(1)
 
-    def spoiled(values: np.ndarray, *arguments: Any) -> PartitionedInverse:
-        if values[0] == 2:
+    def spoiled() -> list[int]:
+        if next(asked) == 2:
             raise NoMemory("full")
-        return build(values, *arguments)
+        return storage()
 
-    maker.build = spoiled
+    maker.storage = spoiled
     with caplog.at_level(logging.WARNING):
         post_all(upload, list(range(1, len(boxes) + 1)))
         maker.thread.submit(lambda: None).result()

@@ -10,7 +10,7 @@ import pytest
 
 from sim_server.backends.compiler import INCLUDE, SOURCES, compiler
 from sim_server.backends.cpu.structs import BALANCE
-from sim_server.backends.gpu.energies import ENERGY_BALANCE, SUMS, node_chunks
+from sim_server.backends.gpu.energies import ENERGY_BALANCE, SUMS, node_chunks, start_sums
 from sim_server.backends.gpu.structs import ENERGY_RECORD
 
 G = np.array([0.3, -9.81, 2.0])
@@ -140,3 +140,18 @@ def test_what_has_too_much_goes_back_and_rests_and_nothing_else(library, on_runa
     if on_runaway == 0:
         assert bodies.records[1]["phase"].tolist() == [2, 2, 2, 0] and not bodies.records[1]["found"].any()
         assert not bodies.records[1]["kinetic"][:3].any()
+
+
+def test_sums_of_the_start_are_those_of_each_body_alone():
+    rng, sizes = np.random.default_rng(3), [1, 5, 40, 2, 17]
+    starts = np.concatenate([[0], np.cumsum(sizes)]).astype(np.int32)
+    mass, x, v = rng.uniform(1, 2, starts[-1]), rng.normal(size=(starts[-1], 3)), rng.normal(size=(starts[-1], 3))
+    found = start_sums(starts, mass, x, v, G, 0.01)
+    for row, own in zip(found, map(slice, starts[:-1], starts[1:]), strict=True):
+        extent = np.ptp(x[own], axis=0)
+        expected = [
+            0.5 * mass[own] @ (v[own] ** 2).sum(axis=1),
+            -mass[own] @ x[own] @ G,
+            0.01 * np.ptp(v[own], 0).max(),
+        ]
+        np.testing.assert_allclose(row, [*expected, np.linalg.norm(extent)], rtol=1e-13, atol=1e-13)

@@ -149,8 +149,8 @@ def test_one_linearization_has_the_launches_of_a_solve_alone(cupy, monkeypatch):
 def test_how_many_trials_there_may_be(cupy, monkeypatch, loops):
     """A loop has as many as a step needs; without it they bound the graph of a step, and that of many steps."""
     few, more = (simulation(monkeypatch, loops, linearizations=n, trials=0) for n in (FEW, FEW + 1))
-    assert [[bool(graph) for graph in row] for row in few.engine.loop.graphs] == [[True, True]] * 2
-    assert [[bool(graph) for graph in row] for row in more.engine.loop.graphs] == [[True, loops]] * 2
+    assert [[bool(graph) for graph in row] for row in few.engine.loop.graphs] == [[True, True, True]] * 2
+    assert [[bool(graph) for graph in row] for row in more.engine.loop.graphs] == [[True, loops, loops]] * 2
     most = {"linearizations": MAX_STATES // 4, "trials": 4}
     if loops:
         assert simulation(monkeypatch, loops, **most).engine.loop.graphs[0][1]

@@ -17,6 +17,7 @@ from sim_server.backends.gpu.device import PRECISIONS, own_headers
 from sim_server.backends.gpu.device import options as device_options
 from sim_server.backends.gpu.energies import BALANCE_TEXT, ELASTIC_TEXT
 from sim_server.backends.gpu.engine import EPILOGUE
+from sim_server.backends.gpu.inverse.apply_inverse import APPLICATION
 from sim_server.backends.gpu.inverse.expansion_batches import INVERSE
 from sim_server.backends.gpu.measured import TEXT as MEASURED_TEXT
 from sim_server.backends.gpu.momentum import MOMENTUM
@@ -51,7 +52,7 @@ def test_the_compiler_agrees_with_all_that_the_loop_shares(tmp_path):
         ("stage_decision.cu", DECISION), ("momentum.cu", MOMENTUM),
         ("contact_state.cuh", structs.CONTACT), ("contact.cu", CONTACT_TEXT),
         ("measured.cu", MEASURED_TEXT), ("step_records.cu", structs.RECORDS),
-        ("inverse/build_inverse.cu", INVERSE),
+        ("inverse/build_inverse.cu", INVERSE), ("inverse/apply_inverse.cu", APPLICATION),
     ],
     ids=lambda value: value if isinstance(value, str) else "layouts",
 )  # fmt: skip
@@ -97,23 +98,32 @@ def test_the_solver_spills_no_registers(threads, blocks, more):
 
 
 def test_thread_blocks_take_all_registers():
-    """256 threads a multiprocessor: in more blocks where there are more bodies, in most where these are small."""
+    """256 threads a multiprocessor: in more blocks where there are more bodies, in most where these are small, unless
+    fewer have A in shared memory."""
     found = {
-        (bodies, nodes): threads_and_blocks(np.full(bodies, nodes), 132)
+        (bodies, nodes): threads_and_blocks(np.full(bodies, nodes), np.full(bodies, 10 * nodes), 132, 233472)
         for bodies, nodes in (
             (1, 720),
             (124, 720),
             (125, 720),
             (264, 160),
             (265, 160),
+            (265, 50),
+            (265, 60),
+            (265, 110),
+            (265, 120),
             (400, 720),
             (1000, 299),
             (1000, 300),
         )
     }
     assert {pair for (bodies, _), pair in found.items() if bodies <= 124} == {(256, 1)}
-    assert {key for key, pair in found.items() if pair == (128, 2)} == {(125, 720), (264, 160), (400, 720), (1000, 300)}
-    assert {key for key, pair in found.items() if pair == (64, 4)} == {(265, 160), (1000, 299)}
+    assert {key for key, pair in found.items() if pair == (128, 2)} == {
+        (125, 720), (264, 160), (400, 720), (1000, 300), (265, 60), (265, 110),
+    }  # fmt: skip
+    assert {key for key, pair in found.items() if pair == (64, 4)} == {
+        (265, 160), (1000, 299), (265, 50), (265, 120),
+    }  # fmt: skip
 
 
 @pytest.mark.slow

@@ -27,7 +27,7 @@ class FakeServer:
         self.endpoint = free_endpoint()
         self.name, self.objects, self.obstacles = name, objects, obstacles
         self.commands: list[pb.Command] = []
-        self.state = "running"
+        self.state, self.stopped = "running", "stopping"  # and the state that the answer to `stop` tells
         self.silent = False
         self.protocol = header().protocol
         self._held: list[zenoh.Query] = []
@@ -99,8 +99,8 @@ class FakeServer:
             return pb.Reply(header=header(), error=f"no object {wanted.object!r}; there is {', '.join(self.objects)}")
         if command.verb == "move_obstacle" and command.target.obstacle not in MOVED:
             return pb.Reply(header=header(), error=f"obstacle {command.target.obstacle!r} is fixed")
-        if command.verb in ("pause", "resume"):
-            state = "paused" if command.verb == "pause" else "running"
+        if command.verb in ("pause", "resume", "stop"):
+            state = {"pause": "paused", "resume": "running", "stop": self.stopped}[command.verb]
             unchanged, self.state = self.state == state, state
             return pb.Reply(header=header(), status=self.status(), unchanged=unchanged)
         taken = pb.Interaction()

@@ -168,6 +168,12 @@ def test_pause_resume_stop(server: FakeServer) -> None:
     assert [command.verb for command in server.commands] == ["pause", "resume", "stop"]
 
 
+def test_a_stop_that_waits_for_a_very_long_step_does_not_tell_it_as_the_last(server: FakeServer) -> None:
+    server.stopped = "running"
+    said = "stops after the step under way, with 50 steps (t = 1.000 s)\n"
+    assert run("stop", "--connect", server.endpoint)[:2] == (0, said)
+
+
 def test_refused_command_is_bad_input(server: FakeServer) -> None:
     code, _, err = run(
         "push", "--object", "spleen", "--at", "0", "0", "0", "--force", "1", "0", "0", "--connect", server.endpoint

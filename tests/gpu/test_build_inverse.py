@@ -71,11 +71,54 @@ def test_it_applies_as_the_triangular_solves_do(gpu, groups, planes, bound):
     assert np.linalg.norm(z - expected) <= bound * np.linalg.norm(expected)
 
 
+@pytest.mark.parametrize("planes", [1, 2])
+@pytest.mark.parametrize("groups", [1, 2, 3, 4])
+def test_one_application_beside_the_steps_is_that_of_the_solver(gpu, groups, planes):
+    from sim_server.backends.gpu.inverse.apply_inverse import InverseApplication
+    from sim_server.backends.gpu.inverse.build_inverse import InverseBuilder
+
+    shape, values = factor(MIDDLE, seed=1)
+    p = plan(shape, 132, groups, planes)
+    builder = InverseBuilder(gpu, shape, p)
+    storage = builder.storage()
+    made = builder.build(values, storage)
+    application = InverseApplication(gpu, p)
+    chunks, scale = expanded(gpu, shape, values, p)
+    for seed in range(3):
+        r = np.random.default_rng(seed).normal(size=shape.size)
+        z = application.begin(made.matrix, made.scale, r, builder._workspace.stream, 132 if seed else 1).result()
+        expected = Application(p, chunks, scale)(r)
+        assert np.linalg.norm(z - expected) <= 1e-5 * np.linalg.norm(expected)
+
+
 def test_few_multiprocessors_make_the_same_bits(gpu):
     shape, values = factor(MIDDLE)
     p = plan(shape, 132, 2)
     (all_chunks, all_scale), (chunks, scale) = (expanded(gpu, shape, values, p, limit) for limit in (None, 3))
     assert np.array_equal(all_chunks.view(np.uint16), chunks.view(np.uint16)) and np.array_equal(all_scale, scale)
+
+
+@pytest.mark.parametrize("count", [1, 3])
+def test_values_in_pinned_memory_make_the_same_bits(gpu, count):
+    """They are copied by the device itself; their memory may be given up, and used again, before that."""
+    from sim_server.backends.gpu.inverse.build_inverse import InverseBuilder
+    from sim_server.backends.gpu.pinned import PinnedArray, pinned_array
+
+    shape, values = factor(MIDDLE)
+    p = plan(shape, 132, 2)
+    chunks, scale = expanded(gpu, shape, values, p)
+    builder = InverseBuilder(gpu, shape, p)
+    storage = builder.storage()
+    for _ in range(count):
+        pinned = pinned_array(gpu.cp, len(values), np.dtype(np.float32))
+        pinned[:] = values
+        assert isinstance(pinned, PinnedArray)
+        made = builder.build(pinned, storage)
+        del pinned
+        pinned_array(gpu.cp, len(values), np.dtype(np.float32))[:] = 3  # other memory, as long as the copy lasts
+    made.event.synchronize()
+    assert np.array_equal(storage.matrix.get().view(np.uint16), chunks.view(np.uint16))
+    assert np.array_equal(storage.scale.get(), scale)
 
 
 def test_the_scale_ends_with_its_largest(gpu):
@@ -121,3 +164,38 @@ def test_another_build_may_make_the_workspace_grow(gpu):
     storage.matrix.fill(0)
     builder.build(values, storage).event.synchronize()
     assert np.array_equal(storage.matrix.get(), before)
+
+
+@pytest.mark.parametrize(("groups", "planes", "limit"), [(1, 1, None), (2, 1, 3), (3, 2, 5)])
+def test_several_at_a_time_have_the_bits_of_each_alone(gpu, groups, planes, limit):
+    """Whatever their number: graphs are made for 1, 4, 16 and 64, and what they leave over is not touched."""
+    from sim_server.backends.gpu.inverse.build_inverse import InverseBuilder
+
+    factors = [factor(SMALL, seed) for seed in range(21)]
+    shape, values = factors[0][0], [each[1] for each in factors]
+    p = plan(shape, 4, groups, planes)
+    alone = [expanded(gpu, shape, each, p, limit) for each in values]
+    builder = InverseBuilder(gpu, shape, p, 64)
+    assert builder.most == 64
+    for count in (1, 2, 4, 5, 21):
+        storages = [builder.storage() for _ in range(22)]
+        made = builder.build_many(values[:count], storages[:count], limit)
+        made[-1].event.synchronize()
+        for storage, inverse, (chunks, scale) in zip(storages, made, alone, strict=False):
+            assert inverse[:2] == (storage.matrix.data.ptr, storage.scale.data.ptr)
+            assert np.array_equal(storage.matrix.get().view(np.uint16), chunks.view(np.uint16))
+            assert np.array_equal(storage.scale.get(), scale)
+        assert not any(storage.scale.get().any() for storage in storages[count:])
+
+
+def test_as_many_at_a_time_as_fit_into_the_workspace(gpu):
+    from sim_server.backends.gpu.inverse.build_inverse import InverseBuilder
+    from sim_server.backends.gpu.inverse.expansion_batches import WORKSPACE
+
+    shape, values = factor(MIDDLE)
+    builder = InverseBuilder(gpu, shape, plan(shape, 132, 1), 64)
+    assert 1 < builder.most < 64 and builder.most * builder._layout.size <= WORKSPACE
+    storages = [builder.storage() for _ in range(builder.most)]
+    builder.build_many([values] * builder.most, storages, None)[0].event.synchronize()
+    chunks = expanded(gpu, shape, values, builder.plan)[0]
+    assert all(np.array_equal(storage.matrix.get().view(np.uint16), chunks.view(np.uint16)) for storage in storages)

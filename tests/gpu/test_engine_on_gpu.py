@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: MIT
 """The native loop on a GPU that is there: what comes home while it runs, what goes in, what it cannot take."""
 
+import dataclasses
 import gc
 import logging
 import threading
@@ -187,3 +188,30 @@ def test_numbers_that_are_not_finite_are_told_as_on_the_cpu():
     assert lines[0] == lines[1]
     assert len(lines[0]) == 1
     assert lines[0][0].startswith("object 'beam', step 3: force is not finite at node ")
+
+
+def test_a_prepared_factor_is_applied_for_its_check_and_used_once_it_is_posted():
+    sim = Simulation.load(SCENE, ["solver.preconditioner=cholesky", "solver.update=never"], "gpu")
+    driver, first = Driver(sim), factor_of(sim)
+    check, last = driver.check, sim.engine.step
+    r = check.vector(first.object, 1)
+    values = sim.engine.factor_memory(len(first.values), first.values.dtype)
+    values[:] = first.values
+    factor = dataclasses.replace(first, values=values)
+    applied = sim.engine.prepare_factor(0, factor, r)
+    z = applied()
+    assert check.reject_reasons([(factor, None)], lambda: z) == [""]
+    exact, told = check.probe(first, None), check.probe_all([(factor, None)], z)[0]
+    assert abs(told.zr / exact.zr - 1) < 1e-3
+    sim.engine.run(2)
+    assert (sim.engine.records()["factor_step"][-2:] != factor.step).all(), "it was not posted"
+    sim.engine.post_factors([0], [factor])
+    sim.engine.settle_factors()
+    sim.engine.run(1)
+    used = sim.engine.records()[-1]
+    assert used["factor_step"] == factor.step and used["status"] == SolveStatus.CONVERGED and last < used["step"]
+    other = dataclasses.replace(first, values=-first.values, step=factor.step + 1)
+    assert sim.engine.prepare_factor(0, other, r)() is not None
+    sim.engine.drop_factor(0, other)
+    sim.engine.run(2)
+    assert (sim.engine.records()["factor_step"] == factor.step).all()

@@ -78,13 +78,30 @@ def test_many_together_are_to_the_bit_those_one_by_one(graph, library):
     one_by_one = [analysis.factorize(matrix).copy() for matrix in matrices]
     assert analysis.most >= 5
     for count in (2, 5, 3, 1):
-        together = analysis.factorize_many(matrices[:count])
+        together = analysis.begin_many(matrices[:count])()
         assert together is not None and len(together) == count
         assert all(map(np.array_equal, together, one_by_one))
-    assert analysis.factorize_many([matrices[0], -matrices[1], matrices[2]]) is None
-    assert analysis.factorize_many([matrices[0], np.full_like(matrices[1], np.nan)]) is None
-    together = analysis.factorize_many(matrices[3:])
+    assert analysis.begin_many([matrices[0], -matrices[1], matrices[2]])() is None
+    assert analysis.begin_many([matrices[0], np.full_like(matrices[1], np.nan)])() is None
+    together = analysis.begin_many(matrices[3:])()
     assert together is not None and all(map(np.array_equal, together, one_by_one[3:]))
+
+
+@arithmetic
+def test_two_may_be_under_way(library):
+    """Neither changes what the other returns, also where one of them has no factor."""
+    graph = GRAPHS["bar"]
+    analysis = Analysis(*graph, library)
+    matrices = [spd(*graph, seed=seed) for seed in range(6)]
+    one_by_one = [analysis.factorize(matrix).copy() for matrix in matrices]
+    first, second = analysis.begin_many(matrices[:3]), analysis.begin_many(matrices[3:])
+    for end, expected in ((first, one_by_one[:3]), (second, one_by_one[3:])):
+        assert all(map(np.array_equal, end(), expected))
+    spoilt, good = analysis.begin_many([matrices[0], -matrices[1]]), analysis.begin_many(matrices[4:])
+    assert spoilt() is None and all(map(np.array_equal, good(), one_by_one[4:]))
+    again = analysis.begin_many(matrices[2:4]), analysis.begin_many(matrices[:2])
+    assert all(map(np.array_equal, again[0](), one_by_one[2:4]))
+    assert all(map(np.array_equal, again[1](), one_by_one[:2]))
 
 
 @arithmetic

@@ -4,6 +4,7 @@
 import logging
 import re
 import sys
+from collections.abc import Callable
 from types import SimpleNamespace
 from typing import Any, ClassVar
 
@@ -22,7 +23,7 @@ from protocol.method import Method
 from protocol.network.factor_parts import bytes_of, part_checksums
 from protocol.refused import Refused
 from protocol.shared_memory.view import SlotMap
-from protocol.validate import check_header, checksum
+from protocol.validate import check_header, checksum, topology_checksum
 
 
 class Payload(bytes):
@@ -159,18 +160,34 @@ def test_a_matrix_is_answered_with_its_factor(worker: Worker, connection: FakeCo
     assert connection.patterns == [("beam", 1)] and connection.library == "diagonal"
 
 
+def test_the_server_is_not_asked_for_a_topology_that_is_known(worker: Worker, connection: FakeConnection) -> None:
+    shape = topology_checksum(connection.topology("a", 1))
+    connection.asked.clear()
+    told = [matrix(k, name, topology=shape) for k, name in ((1, "a"), (2, "b"))]
+    other = matrix(3, "c", topology=shape, method="ssor", omega=1.0)
+    drain(worker, connection, *told, other, matrix(4, "d"), matrix(5, "e", topology=shape, blocks=3))
+    assert connection.asked == [("a", 1), ("c", 1), ("d", 1)], "another method, or another topology, may be"
+    failures = {answer.header.object: answer.failure for answer, _ in connection.answers}
+    assert [name for name, failure in failures.items() if failure] == ["e"]
+    assert "blocks is 3; allowed: 2" in failures["e"]
+
+
 class Together(Diagonal):
     """Factorizes up to three matrices of one pattern together."""
 
     most = 3
     sizes: ClassVar[list[int]] = []
 
-    def factorize_many(self, values: list[np.ndarray], dtype: Any) -> list[np.ndarray] | None:
+    def begin_many(self, values: list[np.ndarray], dtype: Any) -> Callable[[], list[np.ndarray] | None]:
         self.sizes.append(len(values))
-        try:
-            return [self.factorize(each, dtype) for each in values]
-        except ValueError:
-            return None
+
+        def end() -> list[np.ndarray] | None:
+            try:
+                return [self.factorize(each, dtype) for each in values]
+            except ValueError:
+                return None
+
+        return end
 
 
 @pytest.fixture
@@ -201,6 +218,9 @@ def test_one_without_a_factor_does_not_spoil_those_of_others(together: Worker, c
     for k, name in enumerate("abc"):
         connection.received.put(matrix(10 + k, name, scale=-4.0 if name == "b" else 4.0))
     together.step(0.0)
+    assert not connection.answers and together.waiting == 3, "they are under way"
+    together.step(0.0)
+    assert together.idle
     failures = {answer.header.object: bool(answer.failure) for answer, _ in connection.answers}
     assert failures == {"a": False, "b": True, "c": False} and Together.sizes == [3]
 

@@ -6,10 +6,22 @@ import math
 import numpy as np
 import pytest
 
+from protocol import validate
 from protocol.channels import PROTOCOL
 from protocol.messages_pb2 import Command, Factor, Header, Interaction, Vector, WorkerInfo
 from protocol.refused import Refused
-from protocol.validate import array, check_header, check_numbers, check_strings, checksum, parse, take
+from protocol.validate import (
+    CHUNK,
+    all_finite,
+    array,
+    check_header,
+    check_numbers,
+    check_strings,
+    checksum,
+    copied,
+    parse,
+    take,
+)
 
 
 class Huge:
@@ -98,3 +110,42 @@ def test_checksum_is_that_of_the_bytes_and_notices_one_bit() -> None:
     changed = values.copy()
     changed.view(np.uint8)[4321] ^= 1
     assert checksum(changed) != checksum(values)
+
+
+@pytest.mark.parametrize("size", [0, 1, CHUNK, CHUNK + 1, 3 * CHUNK - 1])
+@pytest.mark.parametrize("bad", [None, math.nan, -math.inf])
+def test_one_pass_copies_and_tells_what_two_more_would(size: int, bad: float | None) -> None:
+    source = np.random.default_rng(size).standard_normal(size).astype(np.float32)
+    if bad is not None and size:
+        source[-1] = bad
+    target = np.zeros_like(source)
+    assert copied(source, target, own=target) == (checksum(source), all_finite(source))
+    assert target.tobytes() == source.tobytes()
+
+
+@pytest.mark.parametrize("helpers", [0, 1, 3])
+@pytest.mark.parametrize("bad", [None, 0, -1])
+def test_threads_that_help_change_nothing(monkeypatch: pytest.MonkeyPatch, helpers: int, bad: int | None) -> None:
+    monkeypatch.setattr(validate, "PIECE", 1000)
+    monkeypatch.setattr(validate, "ALONE", 0)
+    monkeypatch.setattr(validate, "helping_threads", lambda: helpers)
+    source = np.random.default_rng(1).standard_normal(12_345).astype(np.float32)
+    if bad is not None:
+        source[bad] = np.inf
+    target = np.zeros_like(source)
+    for own in (source, target):
+        assert copied(source, target, own) == (checksum(source), bad is None)
+        assert target.tobytes() == source.tobytes()
+
+
+def test_what_is_told_is_about_the_own_values() -> None:
+    """The other array is shared: what another process writes there in the meantime must not be told as ours."""
+
+    class Shared(np.ndarray):
+        """Changes as soon as it is written to."""
+
+        def __getitem__(self, place: object) -> np.ndarray:
+            return np.full(len(range(*place.indices(len(self)))), 7, np.float32)  # type: ignore[attr-defined]
+
+    source = np.arange(100, dtype=np.float32)
+    assert copied(source, np.zeros(100, np.float32).view(Shared), own=source)[0] == checksum(source)

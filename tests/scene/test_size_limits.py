@@ -9,7 +9,7 @@ import pytest
 
 from sim_server.errors import InputError
 from sim_server.scene import load
-from sim_server.scene.size_limits import SizeLimits, estimate
+from sim_server.scene.size_limits import Size, SizeLimits, estimate
 
 ROOT = Path(__file__).parents[2]
 OBJECT = """
@@ -65,18 +65,48 @@ def test_a_mesh_in_a_file_is_counted(tmp_path: Path) -> None:
         "bar = [1, 1, 1], size = [1, 1, 1]", f'file = "{mesh}"'
     ).replace("\n[[", "dt = 0.02\n[[", 1))  # fmt: skip
     with pytest.raises(InputError, match="--max-memory allows"):
-        SizeLimits(None, 80.1e6).check(load(path))
+        SizeLimits(None, 126.1e6).check(load(path))
 
 
-def test_the_estimate_grows_as_measured() -> None:
-    """Largest resident memory of servers with a worker and a log, 40 steps [bytes]."""
-    for tets, measured in ((1500, 116.5e6), (12_000, 291.8e6), (39_936, 977.0e6)):
-        assert abs(estimate([tets], True) / measured - 1) < 0.1
-    assert estimate([12_000], False) < estimate([12_000], True)
-    assert estimate([6000, 6000], True) < estimate([12_000], True), "two factors of half the size are smaller"
+MEASURED = [  # largest resident memory of servers with a log [bytes]: bars, solves with factors or without
+    ((5, 5, 10), "linear", True, 134.0e6),
+    ((10, 10, 20), "linear", True, 208.8e6),
+    ((16, 16, 26), "linear", True, 434.7e6),
+    ((28, 28, 43), "linear", True, 1701.3e6),
+    ((5, 5, 10), "quadratic", True, 236.0e6),
+    ((10, 10, 20), "quadratic", True, 1024.9e6),
+    ((16, 16, 26), "linear", False, 185.3e6),
+    ((28, 28, 43), "linear", False, 467.5e6),
+]
+
+
+@pytest.mark.parametrize(("cells", "elements", "factors", "measured"), MEASURED)
+def test_the_estimate_is_near_what_was_measured(
+    cells: tuple[int, int, int], elements: str, factors: bool, measured: float, tmp_path: Path
+) -> None:
+    """The scene passes with a sixth more than was measured, and is refused with a sixth less."""
+    path = scene(tmp_path, list(cells))
+    solver = f'elements = "{elements}"\n[object.effects]'
+    text = path.read_text().replace("[object.effects]", solver)
+    preconditioner = "cholesky" if factors else "block_jacobi"
+    path.write_text(text.replace("[[object]]", f'[solver]\npreconditioner = "{preconditioner}"\n[[object]]', 1))
+    SizeLimits(None, measured * 7 / 6).check(load(path))
+    with pytest.raises(InputError, match="--max-memory allows"):
+        SizeLimits(None, measured * 5 / 6).check(load(path))
+
+
+def test_factors_of_large_bodies_are_not_counted_in_shared_memory() -> None:
+    """A million tets: three copies of L, 2.9 GB each, and the rest."""
+    assert 9e9 < estimate([Size(1_029_000, 182_736)], True) < 12e9
+
+
+def test_two_factors_of_half_the_size_are_smaller() -> None:
+    half, whole = Size(6000, 1300), Size(12_000, 2600)
+    assert estimate([whole], False) == estimate([half, half], False) < estimate([half, half], True)
+    assert estimate([half, half], True) < estimate([whole], True)
 
 
 @pytest.mark.parametrize("size", ["much", "4", "1KB", "-4GB", "1e3GB"])
 def test_bad_sizes_are_named(size: str) -> None:
-    with pytest.raises(InputError, match=f"--max-memory {size}: allowed is a size of at least 80MB"):
+    with pytest.raises(InputError, match=f"--max-memory {size}: allowed is a size of at least 126MB"):
         SizeLimits.of_options(None, size)

@@ -101,3 +101,21 @@ def test_a_pause_of_a_long_step_says_that_it_runs(server: Server, monkeypatch: p
     assert 2 not in server.answers, "the client asks again"
     server.stand_still()
     assert server.answers[2] == ("paused", "")
+
+
+def test_a_stop_tells_the_last_step_however_long_it_takes(server: Server, monkeypatch: pytest.MonkeyPatch) -> None:
+    server.send("resume")
+    monkeypatch.setattr(halts, "HALT_TIMEOUT", 0.0)
+    server.send("stop")
+    server.halts.answer()
+    assert 1 not in server.answers, "it would tell a step that is not the last"
+    server.halts.answer(ended=True)
+    assert server.answers[1] == ("stopping", "")
+
+
+def test_a_stop_in_a_step_without_end_says_that_it_runs(server: Server, monkeypatch: pytest.MonkeyPatch) -> None:
+    server.send("resume")
+    monkeypatch.setattr(halts, "STEPS_TIMEOUT", 0.0)
+    server.send("stop")
+    server.halts.answer()
+    assert server.answers[1] == ("running", "")

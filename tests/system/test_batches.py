@@ -340,6 +340,21 @@ def test_an_object_whose_mesh_changed_loses_its_own_factor_alone(stage: Hand) ->
     stage.first_factors()
 
 
+def test_slots_are_not_lent_again_before_they_are_sent(stage: Hand, monkeypatch: pytest.MonkeyPatch) -> None:
+    """They are filled by the thread that sends them, even if nobody waits for the jobs any more."""
+    dispatch, held = stage.driver.link.dispatch, list[Callable[[], None]]()
+    stage.driver.until(lambda: dispatch.ready() >= len(NAMES) and not stage.driver.link.slots_lent, "room")
+    monkeypatch.setattr(dispatch._sender._queue, "post", lambda send: held.append(send) or True)
+    assert dispatch.submit_many(jobs(950)) == [True] * len(NAMES)
+    for job in dispatch.leases.jobs:
+        dispatch.leases.cancel(job)
+    stage.driver.turn()
+    assert len(held) == 1 and stage.driver.link.slots_lent == 2
+    held[0]()
+    stage.driver.until(lambda: not stage.driver.link.slots_lent, "the slots")
+    assert stage.driver.until(stage.received.try_recv, "the batch") is not None
+
+
 def test_a_worker_of_an_older_version_gets_them_one_by_one(stage: Hand) -> None:
     stage.hello(batches=False)
     info = lambda: [w for w in stage.driver.link.dispatch.workers() if not w.batches]  # noqa: E731

@@ -56,3 +56,21 @@ def test_a_run_that_waited_is_repeated(tmp_path: Path, options: str) -> None:
         assert opened.scalars("beam")["factor_step"][0] == (-1 if "go" in options else 0)
     with Recording(log) as recording:
         assert Replay(recording).run().same
+
+
+def test_a_run_that_does_not_wait_sends_the_matrix_of_its_very_first_step(tmp_path: Path) -> None:
+    """Not that of the second one, which is due dt later."""
+    endpoint = free_endpoint()
+    scene = beam(tmp_path, bar=(1, 1, 2), solver='first_factor = "go"')
+    with ServerLink(listen=[endpoint]) as link, HandWorker(endpoint, link.incarnation) as hand:
+        service = Service(Simulation.load(scene), link, steps=5)
+        hand.hello()
+        until(link.dispatch.workers, "the worker has joined")
+        thread = threading.Thread(target=service.run)
+        thread.start()
+        try:
+            assert hand.receive().step == 0
+        finally:
+            service.commands.stopping = True
+            thread.join(PATIENCE)
+    assert not thread.is_alive()

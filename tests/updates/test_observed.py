@@ -7,10 +7,13 @@ import numpy as np
 import pytest
 
 from protocol import messages_pb2 as pb
+from protocol.factor import Factor
+from protocol.method import Method
 from sim_server.backends.cpu.structs import RECORD
 from sim_server.backends.kinds import Kind
 from sim_server.recording import messages
 from sim_server.service.telemetry import Telemetry
+from sim_server.updates.body_state import on_factors
 from sim_server.updates.driver import Driver
 from sim_server.updates.solve_observer import MIN_TOGETHER
 from tests.scenes import bar, simulation
@@ -52,6 +55,7 @@ def seen(driver: Driver) -> list[tuple]:
             t.solves.lost,
             t.solves.factor_step,
             t.solves.max_factor_age,
+            t.solves.first_excess.value,
             t.failures.refused,
         )
         tuner = () if t.tuner is None else (t.tuner.kind, t.tuner.probe)
@@ -76,6 +80,49 @@ def test_many_records_say_what_each_says(preconditioner, at_once):
         for a, b in zip(one.bodies, many.bodies, strict=True):
             assert a.solves.iteration_cost.value == pytest.approx(b.solves.iteration_cost.value, rel=1e-9)
     assert one.bodies[0].solves.excess > 0
+
+
+def noted(driver: Driver) -> list[tuple]:
+    """What is known of the factors of each body."""
+    out = []
+    for t in driver.bodies:
+        f = t.factors
+        counts = (f.newest, f.used, f.regularized, t.job.in_flight, t.job.sent, t.failures.in_a_row)
+        sums = (f.latency.value, f.cost.value, t.solves.excess, t.solves.latest, t.solves.lost, f.workers)
+        out.append((*counts, *sums, {name: mean.value for name, mean in f.cost_by_method.items()}))
+    return out
+
+
+def test_many_factors_say_what_each_says():
+    """Late ones, ones that nobody asked for, from here and from elsewhere; after failures and with excess summed up."""
+    one, many = drivers("cholesky")
+    rng = np.random.default_rng(0)
+    for step in range(10, 200, 3):
+        chosen = rng.permutation(BODIES)[: rng.integers(1, BODIES + 1)].tolist()
+        asked, failed, lost = rng.random(BODIES) < 0.5, rng.random(BODIES) < 0.2, rng.uniform(0, 9, BODIES)
+        factors = {}
+        for k in chosen:
+            made = int(step - rng.integers(0, 9)) if asked[k] else int(rng.integers(0, step))
+            remedy = "shifted" if rng.random() < 0.2 else ""
+            factors[k] = Factor(
+                "abc"[k], 1, made, True, None, None, f"w{step % 4}", float(rng.uniform(0, 1e-3)), remedy
+            )
+        for driver in (one, many):
+            for k, factor in factors.items():
+                state = driver.bodies[k]
+                state.solves.excess, state.solves.lost = lost[k], 2 * lost[k]
+                state.solves.first_excess.add(lost[k] / 3)
+                if failed[k]:
+                    state.failures.in_a_row += 1
+                if asked[k]:
+                    state.on_job(factor.step, Method())
+                    state.job.in_flight, state.job.sent = True, factor.step
+        expected = [one.bodies[k].on_factor(factor, step) for k, factor in factors.items()]
+        states = [many.bodies[k] for k in factors]
+        assert on_factors(states, many.table, list(factors.values()), step) == expected
+        assert noted(one) == noted(many)
+    assert min(t.factors.used for t in one.bodies) > 5
+    assert one.bodies[0].factors.cost_by_method and one.bodies[0].factors.regularized
 
 
 def told(listening: bool, monkeypatch) -> tuple[list[pb.Steps], list[pb.Status], int]:

@@ -26,6 +26,7 @@ from sim_server.updates.factor_source import Inline, Job
 from sim_server.updates.policies.free_running import MAX_REQUESTS
 from sim_server.updates.stats import flops
 from tests.scenes import bar, factor_of, simulation
+from tests.solver.solves import applied
 from tests.support.virtual_workers import VirtualWorkers
 
 
@@ -487,6 +488,26 @@ def test_a_large_factor_that_is_no_use_is_refused_beside_the_steps(sent):
     wait([each.reasons for each in driver.checks])
     assert driver.advance(2)["factor_step"].tolist() == [-1, -1]
     assert driver.bodies[0].failures.refused == 1 and not driver.bodies[0].job.in_flight
+
+
+@pytest.mark.parametrize(("sign", "used"), [(1, 1), (-1, 0), (None, 1)])
+def test_what_applies_a_factor_beside_its_check_is_believed_in_its_place(sent, monkeypatch, sign, used):
+    """sign: of what it tells to be P^-1 r; None: it comes to nothing, and the check applies the factor itself."""
+    driver, factor, go = sent
+    dropped: list[Factor] = []
+
+    def prepare(body: int, given: Factor, r: np.ndarray) -> Any:
+        assert body == 0 and given is factor
+        return lambda: None if sign is None else sign * applied(factor.pattern, factor.values)(r)
+
+    monkeypatch.setattr(driver.engine, "prepare_factor", prepare)
+    monkeypatch.setattr(driver.engine, "drop_factor", lambda body, given: dropped.append(given))
+    driver.adopt([factor])
+    go.set()
+    wait([each.reasons for each in driver.checks])
+    records = driver.advance(2)
+    assert (records["factor_step"] == (factor.step if used else -1)).all()
+    assert driver.bodies[0].factors.used == used and dropped == ([] if used else [factor])
 
 
 def test_excess_iterations_are_summed_until_the_next_matrix_goes_out():

@@ -8,8 +8,8 @@ import pytest
 
 from sim_server.updates.driver import Driver
 from sim_server.updates.factor_source import Inline, Job
-from sim_server.updates.policies.free_running import MAX_WAIT, Async
-from sim_server.updates.prefetch import MAX_DEPTH, TRANSFER, PrefetchDepth
+from sim_server.updates.policies.free_running import Async
+from sim_server.updates.prefetch import MAX_DEPTH, MAX_WAIT, MORE, TRANSFER, PrefetchDepth
 from tests.scenes import bar
 from tests.updates.test_policies import falling, patterns_of
 
@@ -38,6 +38,26 @@ def test_as_many_as_workers_can_take_within_a_step(period, service, workers, dep
     prefetch.update(np.array([service, np.nan, service]), workers)
     assert prefetch.depth == pytest.approx(depth, abs=1)
     assert TRANSFER < 0.002
+
+
+def test_copies_that_take_several_steps_are_begun_ahead():
+    """As on a GPU, whose steps go on while a matrix travels to the host."""
+    prefetch, seconds = paced(0.001), np.array([2e-4])
+    prefetch.on_copy(0.01)
+    prefetch.update(seconds, 1, queued=True)
+    assert prefetch.depth == 0, "nothing was sent yet"
+    for k in range(1, 100):
+        prefetch.on_sent(20, 0.02 * k)  # 1,000 a second: 10 while a copy travels, of 50 that the worker could make
+    prefetch.update(seconds, 1, queued=True)
+    assert prefetch.depth == pytest.approx(MORE * 10, rel=0.1) and prefetch.patience == pytest.approx(
+        MAX_WAIT + 9, abs=1
+    )
+    for k in range(100, 200):
+        prefetch.on_sent(200, 0.02 * k)
+    prefetch.update(seconds, 1, queued=True)
+    assert prefetch.depth == pytest.approx(50, abs=1), "as many as it can make"
+    prefetch.update(seconds, 1)
+    assert prefetch.depth == 0, "jobs that travel one by one keep a worker waiting"
 
 
 def test_nothing_is_known_before_the_first_steps_and_factors():

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from protocol.factor import Factor, FactorPattern
-from sim_server.arrays import Int32
+from sim_server.arrays import Float64, Int32
 from sim_server.backends.base import ArrayChange, Capability, CutInput, EngineInput, Launch
 from sim_server.backends.central_difference import NODAL as NODAL_OF_SUBSTEPS
 from sim_server.backends.central_difference import CentralDifference
@@ -794,6 +794,16 @@ class CpuEngine(Reports):
 
     def prepare_for_factors(self) -> None:
         """Does nothing."""
+
+    def prepare_factor(self, body: int, factor: Factor, r: Float64) -> None:
+        """Returns None: a factor is applied as it comes."""
+
+    def drop_factor(self, body: int, factor: Factor) -> None:
+        """Does nothing."""
+
+    def factor_memory(self, count: int, dtype: np.dtype[Any]) -> NDArray[Any]:
+        """Makes an array for values of a factor."""
+        return np.empty(count, dtype)
 
     def expect_factors(self, body: int, pattern: FactorPattern) -> None:
         """Does nothing: a factor is applied as it comes."""

@@ -160,12 +160,10 @@ class DeviceEnergies:
         balance["elastic"][list(starts)] = self._sum.get()[list(starts)]
         if bodies is not None:
             balance["phase"][list(bodies)] = 0  # WELL
-        for body, nodes in enumerate(map(slice, e.starts[:-1], e.starts[1:])):
-            if body not in starts:
-                continue
-            row = balance[body : body + 1]
-            sums = start_sums(e.mass[nodes], x[nodes], v[nodes], e.gravity, self._dt)
-            library().wf_gpu_start_balance(row.ctypes.data, sums.ctypes.data, self._dt, int(e.inertia))
+        sums, begin = start_sums(e.starts, e.mass, x, v, e.gravity, self._dt), library().wf_gpu_start_balance
+        rows, at = balance.ctypes.data, sums.ctypes.data
+        for body in starts:
+            begin(rows + BALANCE.itemsize * body, at + sums.strides[0] * body, self._dt, int(e.inertia))
         self._balance.set(np.frombuffer(balance.tobytes(), np.uint8))
         self.started = True
 
@@ -188,12 +186,14 @@ def node_chunks(starts: Int32, nodes: int) -> NDArray[Any]:
 
 
 def start_sums(
-    mass: Float64, x: Float64, v: Float64, gravity: Float64, dt: float
+    starts: Int32, mass: Float64, x: Float64, v: Float64, gravity: Float64, dt: float
 ) -> Float64:  # fmt: skip
-    """Returns kinetic and potential energy [J], the largest difference of dt v along an axis [m], the diagonal [m].
+    """Returns of each body kinetic and potential energy [J], the largest difference of dt v along an axis [m] and the
+    diagonal [m], (bodies, 4).
 
-    mass: (n,) [kg]. x, v: (n, 3) [m], [m/s]. gravity: (3,) [m/s2]. dt [s].
+    starts: (bodies + 1,), first node of each. mass: (n,) [kg]. x, v: (n, 3) [m], [m/s]. gravity: (3,) [m/s2]. dt [s].
     """
-    stride = float(dt * np.ptp(v, axis=0).max())
-    diagonal = float(np.linalg.norm(np.ptp(x, axis=0)))
-    return np.array([0.5 * mass @ (v**2).sum(axis=1), -mass @ (x @ gravity), stride, diagonal])
+    first = starts[:-1]
+    extent_x, extent_v = (np.maximum.reduceat(each, first) - np.minimum.reduceat(each, first) for each in (x, v))
+    kinetic, potential = (np.add.reduceat(mass * each, first) for each in (0.5 * (v**2).sum(axis=1), -(x @ gravity)))
+    return np.column_stack([kinetic, potential, dt * extent_v.max(axis=1), np.linalg.norm(extent_x, axis=1)])

@@ -30,10 +30,11 @@ from sim_server.backends.gpu.factor_upload import FactorUpload
 from sim_server.backends.gpu.held import HeldForces, leading
 from sim_server.backends.gpu.kernel_fusion import DOMAINS, Epilogue, FusedKernel, Prologue, fuse
 from sim_server.backends.gpu.known_patterns import KnownPatterns
-from sim_server.backends.gpu.loop import CAPACITY, MANY, DeviceLoop
+from sim_server.backends.gpu.loop import CAPACITY, GRAPH_STEPS, DeviceLoop
 from sim_server.backends.gpu.mailbox import ChangeMailbox, DeviceMailbox
 from sim_server.backends.gpu.measured import MeasuredReport
 from sim_server.backends.gpu.newton import NewtonIteration, NewtonPhases, begins_beside
+from sim_server.backends.gpu.pinned import pinned_array
 from sim_server.backends.gpu.rosenbrock import ATTEMPTS, RosenbrockStep
 from sim_server.backends.gpu.solver import PCG_BODY, SETTINGS_BYTES, PcgSolver
 from sim_server.backends.gpu.splits import DeviceSplits, Staged
@@ -55,7 +56,8 @@ from sim_server.backends.state import StateArray
 MOST_GRABS = 1024  # pushes and grabs at a time, of which forces are told
 MOST_TOLD = 16  # other bodies whose forces on a body are told, at most
 GRAB_BLOCKS, GRAB_THREADS = 32, 128  # of the kernel react (effects/touch.cu)
-FEW = 16  # largest number of trials in a step without loops for which MANY steps are captured in one graph
+PREPARED_WITHIN = 1.0  # s in which an inverse that is prepared for a check is begun, else the check goes without
+FEW = 16  # largest number of trials in a step without loops for which several steps are captured in one graph
 EPILOGUE = Declarations("backends/gpu/step_epilogue.cu")
 STEP_EPILOGUE = EPILOGUE.dtype("StepEpilogue")
 
@@ -99,8 +101,9 @@ class GpuEngine(DeviceLoop):
             substep_forces, assemble = assemble, []
         ranges, arrays, dt, newton = given.ranges, given.arrays, given.dt, given.newton
         stages, precision = given.stages, given.solver.factor_precision
-        fine = precision == "float32" or (precision == "auto" and stages is not None and stages.factor_alone)
-        planes = 2 if fine else 1  # float16 numbers per entry of an inverse
+        if precision == "auto" and stages is not None and stages.factor_alone:
+            precision = "float32"
+        planes = {"float16": 1, "float32": 2}.get(precision)  # float16 numbers per entry of an inverse
         budgets = bool(given.solver.budget or given.solver.step_budget)
         errors = given.errors or budgets
         self.gpu, self._arrays = gpu, arrays
@@ -311,7 +314,7 @@ class GpuEngine(DeviceLoop):
         """Captures the graphs of the steps, of the energies and of the records."""
         many = self._newton is None or self._newton.loops or self._newton.rounds <= FEW
         for begin in (False, True):
-            for steps in (1, MANY):
+            for steps in GRAPH_STEPS:
                 if steps > 1 and not many:
                     self._graphs.append(None)
                     continue
@@ -477,6 +480,27 @@ class GpuEngine(DeviceLoop):
         patterns are known from earlier runs."""
         self.solver.compile_builder()
         self._patterns.plan()
+
+    def prepare_factor(self, body: int, factor: Factor, r: Float64) -> Callable[[], Float64 | None]:
+        """Builds the inverse of a factor beside caller and steps, and applies it to r; returns what waits for that."""
+        coming = self._factor_upload.prepare(body, factor.pattern, factor.values, factor.step, r)
+
+        def applied() -> Float64 | None:
+            try:
+                found = coming.result(PREPARED_WITHIN)
+            except TimeoutError:  # a factor before it waits for a step, as in a pause
+                return None
+            return found.result() if found is not None else None
+
+        return applied
+
+    def drop_factor(self, body: int, factor: Factor) -> None:
+        """Gives up a factor that may have been prepared, and is not posted."""
+        self._factor_upload.drop(body, factor.values)
+
+    def factor_memory(self, count: int, dtype: np.dtype[Any]) -> NDArray[Any]:
+        """Makes an array for values of a factor, from which the device copies them."""
+        return pinned_array(self.gpu.cp, count, dtype)
 
     def expect_factors(self, body: int, pattern: FactorPattern) -> None:
         """Begins to plan the inverses of factors of a pattern that will come, beside the caller."""

@@ -136,11 +136,11 @@ extern "C" __global__ void __launch_bounds__(CONTACT_THREADS) sweep_faces(const 
 
 // --- the end of a step --------------------------------------------------------------------------------------------------------------
 
-// Notes which triangles of a body y takes into obstacles; returns the number of their nodes. Done by a whole thread block.
-__device__ int note_passages(const ContactArguments& c, int body) {
+// Notes which triangles of a body y takes into obstacles. Returns whether there are such. Done by a whole thread block.
+__device__ bool note_passages(const ContactArguments& c, int body) {
     const FaceTables t = face_tables(c);
     const FaceMotion m = face_motion(c, true);
-    double nodes[1] = {0};
+    bool found = false;
     for (int r = c.faces.start[body] + threadIdx.x; r < c.faces.start[body + 1]; r += CONTACT_THREADS) {
         FaceRow& own = face_row(c, r);
         FaceWays ways(c, m, r);
@@ -150,11 +150,10 @@ __device__ int note_passages(const ContactArguments& c, int body) {
             if (!ways.past(c, o, 0) || passage_of_face(t, r, o, ways.ways, &time).obstacle < 0) continue;
             own.held_at = o;
             own.time = time;
-            for (int a = 0; a < 3; ++a) nodes[0] += c.free[nodes_of_face(t, r)[a]] != 0;
+            found = true;
         }
     }
-    sum_block(nodes);
-    return (int)nodes[0];
+    return !__syncthreads_and(!found);
 }
 
 // Sets a node of such triangles back: of several the last one, by obstacle, then by number.
@@ -177,31 +176,30 @@ __device__ void hold_node(const ContactArguments& c, const SurfaceNode& n) {
     put_at(c, n, from, back);
 }
 
-// Sets what y still takes into obstacles back; returns the number of nodes. Done by a whole thread block.
+// Sets what y still takes into obstacles back; returns the number of nodes that are moved. Done by a whole thread block, whose threads have
+// nodes of their own.
 __device__ int hold_body(const ContactArguments& c, int body) {
     const int first = c.faces.node_start[body], last = c.faces.node_start[body + 1];
-    double clipped[1];
-    int held = 0;
-    for (int round = 0; round <= HOLDS; ++round) {
-        clipped[0] = 0;
-        for (int i = first + threadIdx.x; i < last; i += CONTACT_THREADS) {
-            const SurfaceNode n = SurfaceNode::at(c, i);
-            if (n.pair >= 0) clipped[0] += clip(c, n);
-        }
-        __threadfence();
-        sum_block(clipped);
-        held += (int)clipped[0];
-        if (round == HOLDS) break;
-        const int passed = note_passages(c, body);
-        if (!passed) break;
-        held += passed;
-        for (int i = first + threadIdx.x; i < last; i += CONTACT_THREADS) {
-            const SurfaceNode n = SurfaceNode::at(c, i);
-            if (n.pair >= 0) hold_node(c, n);
-        }
+    auto each_own = [&](auto f) {
+        for (int i = first + threadIdx.x; i < last; i += CONTACT_THREADS)
+            if (const SurfaceNode n = SurfaceNode::at(c, i); n.pair >= 0) f(n);
+    };
+    each_own([&](const SurfaceNode& n) {
+        for (long long k = 3ll * n.node; k < 3ll * n.node + 3; ++k) c.start[k] = c.y[k];
+    });
+    for (int round = 0;; ++round) {
+        each_own([&](const SurfaceNode& n) { clip(c, n); });
         __syncthreads();
+        if (round == HOLDS || !note_passages(c, body)) break;
+        each_own([&](const SurfaceNode& n) { hold_node(c, n); });
     }
-    return held;
+    double moved[1] = {0};
+    each_own([&](const SurfaceNode& n) {
+        const real *y = c.y + 3ll * n.node, *before = c.start + 3ll * n.node;
+        moved[0] += y[0] != before[0] || y[1] != before[1] || y[2] != before[2];
+    });
+    sum_block(moved);
+    return (int)moved[0];
 }
 
 // Before finish_contact: holds a body back, and keeps the forces of its triangles for the next step.

@@ -1,16 +1,21 @@
 # SPDX-License-Identifier: MIT
 """Upload of factors: a partitioned inverse is built beside the steps, then posted into the mailbox of the body.
 
-Each body has two storages per pattern (double buffering). A build begins once the inverse before it is in use and no
-step under way reads the other storage. A factor that arrives earlier is queued; a newer one replaces it. Plans, made
-once per pattern, and the copies of large factors, or of many, are left to a thread (PcgSolver.beside), for which the
-thread that serves the loop does not wait.
+Each body has two storages per pattern and number of binary digits (double buffering). A build begins once the inverse
+before it is in use and no step under way reads the other storage. A factor that arrives earlier is queued; a newer one
+replaces it. Plans, made once per pattern, and the copies of large factors, or of many, are left to a thread
+(PcgSolver.beside), for which the thread that serves the loop does not wait. Many small ones of one
+plan are built together.
+
+A factor may be *prepared* while it is checked: its inverse is built, applied once for the check, and kept out of use
+until the factor is posted, or dropped.
 """
 
 import logging
 import threading
-from collections.abc import Callable, Sequence
-from concurrent.futures import Future, wait
+from collections.abc import Mapping, Sequence
+from concurrent.futures import Future, InvalidStateError, wait
+from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any, NamedTuple
@@ -18,69 +23,136 @@ from typing import Any, NamedTuple
 from numpy.typing import NDArray
 
 from protocol.factor import FactorPattern
+from sim_server.arrays import Float64
 from sim_server.backends.compiler import CompileError
 from sim_server.backends.gpu.device import Gpu, no_memory_left
+from sim_server.backends.gpu.inverse.apply_inverse import Applied
 from sim_server.backends.gpu.inverse.build_inverse import InverseStorage, PartitionedInverse
 from sim_server.backends.gpu.loop import DeviceLoop
 from sim_server.backends.gpu.mailbox import DeviceMailbox
 from sim_server.backends.gpu.solver import SETTINGS_BYTES, PcgSolver, PlannedInverse
+from sim_server.backends.gpu.structs import Mail
 
 log = logging.getLogger(__name__)
 
 SMALL = 1 << 20  # bytes of a factor that is copied at once
 MANY = 4  # small factors that come together, from which on none is built at once
-MAX_PATTERNS = 2  # of a body at a time; workers with different libraries send different patterns
+TOGETHER = 64  # factors of one plan that are handed over together
+BUSY = 0.25  # share of dt that steps in real time take, up to which builds may have the whole device
+MAX_KINDS = 2  # of inverses of a body at a time; workers with different libraries send different patterns
+InverseKind = tuple[int, int]
+"""Of inverses: id of the pattern, float16 numbers per entry."""
 
 
 class UploadedFactor(NamedTuple):
-    """A factor on the device, complete once the event of its inverse is. step: of the matrix it was made from."""
+    """A factor on the device, complete once the event of its inverse is.
+
+    step: of the matrix it was made from
+    planes: float16 numbers per entry
+    """
 
     inverse: PartitionedInverse
     storage: InverseStorage
     step: int
     pattern: FactorPattern
+    planes: int
+
+    @property
+    def kind(self) -> InverseKind:
+        """Of its inverse."""
+        return self.pattern.id, self.planes
 
 
-class GivenFactor(NamedTuple):
-    """A factor that came. Its values do not change any more."""
+@dataclass(eq=False)
+class GivenFactor:
+    """A factor that came. Its values do not change any more.
+
+    r: vector that its inverse is to be applied to. None: to none
+    applied: P^-1 r on its way; None: nobody applies it
+    wanted: it is to be used; False: once it is posted
+    dropped: nobody wants it any more
+    """
 
     pattern: FactorPattern
     values: NDArray[Any]
     step: int
+    r: Float64 | None = None
+    applied: "Future[Applied | None]" = field(default_factory=Future)
+    wanted: bool = True
+    dropped: bool = False
+
+    def drop(self) -> None:
+        """Gives it up."""
+        self.dropped = True
+        self.tell(None)
+
+    def tell(self, applied: Applied | None) -> None:
+        """Tells who waits for P^-1 r, if it is not told yet."""
+        with suppress(InvalidStateError):
+            self.applied.set_result(applied)
+
+
+class ChosenPlan(NamedTuple):
+    """What the inverse of a factor is built by.
+
+    planes: float16 numbers per entry
+    spare: a storage that no step reads; None: one is to be made
+    """
+
+    body: int
+    given: GivenFactor
+    planes: int
+    plan: Future[PlannedInverse]
+    spare: InverseStorage | None
+
+
+class Builds(NamedTuple):
+    """Inverses that are built beside the caller.
+
+    given: by body
+    made: of each, in this order, or why there is none
+    """
+
+    given: dict[int, GivenFactor]
+    made: Future[list[UploadedFactor | Exception]]
 
 
 @dataclass
 class BodyUploads:
     """Factors of one body.
 
-    storages: by id of the pattern
+    planes: float16 numbers per entry of the last factor's inverse, or of the first one's as expected
+    storages: by kind
     leaving: the factor in use before, and the number of steps after whose completion no step reads it
-    posted: not taken by the loop yet
-    building: in the thread of the plans, and the factor that it is of
+    posted: not taken by the loop yet, in this mail
+    building: in the thread of the plans, with others
+    built: prepared, and the factor that it is of, which is neither posted nor dropped yet
     queued: a factor that waits for a storage, or for that thread
     warned: True after the first factor that could not be used
     """
 
     name: str
     mailbox: DeviceMailbox
-    storages: dict[int, list[InverseStorage]] = field(default_factory=dict)
+    planes: int
+    storages: dict[InverseKind, list[InverseStorage]] = field(default_factory=dict)
     in_use: UploadedFactor | None = None
     leaving: tuple[UploadedFactor, int] | None = None
     posted: UploadedFactor | None = None
-    building: tuple[Future[UploadedFactor], GivenFactor] | None = None
+    mail: Mail | None = None
+    building: Builds | None = None
+    built: tuple[UploadedFactor, GivenFactor] | None = None
     queued: GivenFactor | None = None
     warned: bool = False
 
     @property
     def free(self) -> bool:
         """True if a build may begin: a storage is free, or will be made."""
-        return self.posted is None and self.leaving is None and self.building is None
+        return self.posted is None and self.leaving is None and self.building is None and self.built is None
 
-    @property
-    def patterns(self) -> set[int]:
-        """Ids of the patterns whose plans are needed."""
-        coming = [given for given in (self.queued, self.building and self.building[1]) if given]
-        return {*self.storages, *(given.pattern.id for given in coming)}
+    def kinds(self, body: int) -> set[InverseKind]:
+        """Kinds of inverses whose plans are needed, or may be. body: number of this one"""
+        coming = [given for given in (self.queued, self.building and self.building.given[body]) if given]
+        return {*self.storages, *((given.pattern.id, planes) for given in coming for planes in (1, 2))}
 
 
 class FactorUpload:
@@ -95,9 +167,12 @@ class FactorUpload:
         self, gpu: Gpu, solver: PcgSolver, loop: DeviceLoop, names: Sequence[str], mailboxes: Sequence[DeviceMailbox]
     ):
         self._gpu, self._solver, self._loop = gpu, solver, loop
-        self._uploads = [BodyUploads(name, box) for name, box in zip(names, mailboxes, strict=True)]
+        planes = solver.planes or 1
+        self._uploads = [BodyUploads(name, box, planes) for name, box in zip(names, mailboxes, strict=True)]
         self._lock = threading.RLock()
-        self._waiting: set[int] = set()  # bodies with a queued factor, or one that is built
+        self._waiting: set[int] = set()  # bodies with a queued factor
+        self._builds: list[Builds] = []  # under way beside the caller
+        self._known: set[InverseKind] = set()  # of which storages were made
 
     def expect(self, body: int, pattern: FactorPattern) -> None:
         """Begins to plan the inverses of factors of a pattern, beside the caller."""
@@ -110,27 +185,89 @@ class FactorUpload:
         any more.
         """
         with self._lock:
+            self._refresh(body)
+            if not self._use_prepared(body, values):
+                self._enqueue(body, GivenFactor(pattern, values, step))
+                self._begin_queued([body])
+
+    def prepare(
+        self, body: int, pattern: FactorPattern, values: NDArray[Any], step: int, r: Float64
+    ) -> "Future[Applied | None]":  # fmt: skip
+        """Builds the inverse of a factor, beside the caller, and applies it to r (n,); it is used once these very
+        values are posted. Returns P^-1 r; None as its result if it comes to nothing."""
+        given = GivenFactor(pattern, values, step, r, wanted=False)
+        with self._lock:
+            self._refresh(body)
+            self._enqueue(body, given)
+            self._begin_queued([body], beside=True)
+        return given.applied
+
+    def drop(self, body: int, values: NDArray[Any]) -> None:
+        """Gives up a factor that was prepared and not posted; any other one is let alone."""
+        with self._lock:
             uploads = self._uploads[body]
             self._refresh(body)
-            uploads.queued = GivenFactor(pattern, values, step)
-            self._begin_queued(body)
+            given = self._prepared(body, values)
+            if given is None:
+                return
+            given.drop()
+            if uploads.built is not None and uploads.built[1] is given:
+                uploads.built = None
+            if uploads.queued is given:
+                uploads.queued = None
+            self._begin_queued([body])
+
+    def _prepared(self, body: int, values: NDArray[Any]) -> GivenFactor | None:
+        """Returns the factor with these values that is prepared and not posted."""
+        uploads = self._uploads[body]
+        building = None if uploads.building is None else uploads.building.given[body]
+        coming = (uploads.queued, building, None if uploads.built is None else uploads.built[1])
+        return next((each for each in coming if each is not None and not each.wanted and each.values is values), None)
+
+    def _use_prepared(self, body: int, values: NDArray[Any]) -> bool:
+        """Has a prepared factor used, at once if it is built; False if there is none with these values."""
+        uploads = self._uploads[body]
+        given = self._prepared(body, values)
+        if given is None:
+            return False
+        given.wanted = True
+        if uploads.built is not None and uploads.built[1] is given:
+            (factor, _), uploads.built = uploads.built, None
+            self._post(body, given, factor)
+        return True
+
+    def _enqueue(self, body: int, given: GivenFactor) -> None:
+        """Puts a factor in the place of the one that waits, or that waits to be posted."""
+        uploads = self._uploads[body]
+        if uploads.queued is not None:
+            uploads.queued.drop()
+        if uploads.built is not None:
+            uploads.built[1].drop()
+            uploads.built = None
+        uploads.queued = given
 
     def post_many(self, given: Sequence[tuple[int, FactorPattern, NDArray[Any], int]]) -> None:
         """Takes factors of different bodies, each as `post` takes one. Inverses of many are built beside the caller,
-        who would wait for one after another."""
+        who would wait for one after another, those of one plan together."""
         with self._lock:
+            waiting = []
             for body, pattern, values, step in given:
                 self._refresh(body)
-                self._uploads[body].queued = GivenFactor(pattern, values, step)
-                self._begin_queued(body, len(given) >= MANY)
+                if not self._use_prepared(body, values):
+                    self._enqueue(body, GivenFactor(pattern, values, step))
+                    waiting.append(body)
+            self._begin_queued(waiting)
 
     def advance(self) -> None:
         """Posts what was built beside the caller, and begins the builds that have waited for a storage."""
         with self._lock:
-            waiting = sorted(self._waiting)
-            for body in waiting:
-                self._refresh(body)
-                self._begin_queued(body, len(waiting) >= MANY)
+            for builds in [each for each in self._builds if each.made.done()]:
+                self._finish(builds)
+            if self._waiting:
+                waiting = sorted(self._waiting)
+                for body in waiting:
+                    self._refresh(body)
+                self._begin_queued(waiting)
 
     def settle(self) -> None:
         """Waits until the next step will use the newest factors. Only while the loop stands still."""
@@ -138,20 +275,21 @@ class FactorUpload:
             while (building := self._settled(body)) is not None:
                 wait([building])  # without the lock: the thread that serves the loop goes on
 
-    def _settled(self, body: int) -> "Future[UploadedFactor] | None":
+    def _settled(self, body: int) -> "Future[list[UploadedFactor | Exception]] | None":
         """Has the next step use the newest factor of a body; returns a build that must be waited for first."""
         with self._lock:
             uploads = self._uploads[body]
             self._refresh(body)
             if uploads.queued is not None and uploads.building is None:
+                uploads.built = None
                 if uploads.posted is not None and uploads.mailbox.withdraw():
                     uploads.posted.inverse.event.synchronize()  # its storage may be reused
-                    uploads.posted = None
+                    uploads.posted = uploads.mail = None
                 self._refresh(body)
                 uploads.leaving = None
-                self._begin_queued(body)
+                self._begin_queued([body])
             if uploads.building is not None:
-                return uploads.building[0]
+                return uploads.building.made
             if uploads.posted is not None:
                 uploads.posted.inverse.event.synchronize()
             return None
@@ -166,56 +304,170 @@ class FactorUpload:
     def _refresh(self, body: int) -> None:
         """Updates the state of the factors: built, taken by the loop, out of use."""
         uploads = self._uploads[body]
-        if uploads.building is not None and uploads.building[0].done():
-            (future, given), uploads.building = uploads.building, None
-            self._finish(body, given.pattern, future.result)
-        if uploads.posted is not None and uploads.mailbox.taken:
-            if uploads.in_use is not None:  # steps launched until now may still read it
-                uploads.leaving = (uploads.in_use, int(self._loop.loop.launched))
-            uploads.in_use, uploads.posted = uploads.posted, None
+        if uploads.building is not None and uploads.building.made.done():
+            self._finish(uploads.building)
+        if uploads.posted is not None and uploads.mail is not None and uploads.mailbox.taken:
+            if uploads.in_use is not None:  # steps launched until then may still read it
+                uploads.leaving = (uploads.in_use, int(uploads.mail.taken))
+            uploads.in_use, uploads.posted, uploads.mail = uploads.posted, None, None
         if uploads.leaving is not None and self._loop.step >= uploads.leaving[1]:
             uploads.leaving = None
 
-    def _begin_queued(self, body: int, beside: bool = False) -> None:
-        """Begins to build the queued factor, if there is one and it need not wait. beside: not in this thread"""
-        uploads = self._uploads[body]
-        if uploads.queued is not None and uploads.free:
-            given, uploads.queued = uploads.queued, None
-            self._begin(body, given, beside)
-        if uploads.queued is None and uploads.building is None:
-            self._waiting.discard(body)
-        else:
-            self._waiting.add(body)
+    def _begin_queued(self, bodies: Sequence[int], beside: bool = False) -> None:
+        """Begins to build the queued factors of some bodies that need not wait: at once if they are few, small and
+        planned and not `beside`, else in the thread of the plans."""
+        small: list[int] = []
+        for body in bodies:
+            uploads = self._uploads[body]
+            if uploads.queued is None or not uploads.free:
+                (self._waiting.discard if uploads.queued is None else self._waiting.add)(body)
+            elif uploads.queued.values.nbytes > SMALL or beside:
+                self._begin_beside([body])
+            elif len(bodies) < MANY:
+                self._begin_now(body)
+            else:
+                small.append(body)
+        for k in range(0, len(small), TOGETHER):
+            self._begin_beside(small[k : k + TOGETHER])
 
-    def _begin(self, body: int, given: GivenFactor, beside: bool) -> None:
-        """Builds an inverse: at once if it is small, planned and not `beside`, else in the thread of the plans."""
+    def _take_queued(self, body: int) -> tuple[int, GivenFactor, Mapping[InverseKind, InverseStorage | None]]:
+        """Takes the queued factor of a body, with the storages that no step reads."""
         uploads = self._uploads[body]
-        plan = self._solver.begin_plan(body, given.pattern)
+        given, uploads.queued = uploads.queued, None
+        assert given is not None
+        self._waiting.discard(body)
         used = uploads.in_use.storage if uploads.in_use else None
-        spare = next((s for s in uploads.storages.get(given.pattern.id, []) if s is not used), None)
-        build = partial(self._build, plan, given, spare)
-        if plan.done() and given.values.nbytes <= SMALL and not beside:
-            self._finish(body, given.pattern, build)
+        spare = {kind: next((s for s in made if s is not used), None) for kind, made in uploads.storages.items()}
+        return body, given, spare
+
+    def _begin_now(self, body: int) -> None:
+        chosen = self._chosen(*self._take_queued(body))
+        if chosen.plan.done():
+            self._post(body, chosen.given, self._build([chosen])[0])
         else:
-            uploads.building = self._solver.beside(build), given
+            builds = self._note([chosen.given], [body])
+            self._solver.beside(partial(self._end, [chosen], builds.made))
 
-    def _build(
-        self, plan: Future[PlannedInverse], given: GivenFactor, spare: InverseStorage | None
-    ) -> UploadedFactor:  # fmt: skip
-        """Begins to build an inverse in a storage, a new one unless there is one to spare. The plan is made."""
-        builder = plan.result().builder
-        storage = builder.storage() if spare is None else spare
+    def _begin_beside(self, bodies: Sequence[int]) -> None:
+        work = [self._take_queued(body) for body in bodies]
+        builds = self._note([given for _, given, _ in work], bodies)
+        self._solver.beside(partial(self._choose_and_build, work, builds.made))
+
+    def _note(self, given: Sequence[GivenFactor], bodies: Sequence[int]) -> Builds:
+        builds = Builds(dict(zip(bodies, given, strict=True)), Future())
+        for body in bodies:
+            self._uploads[body].building = builds
+        self._builds.append(builds)
+        return builds
+
+    def _chosen(
+        self, body: int, given: GivenFactor, spare: Mapping[InverseKind, InverseStorage | None]
+    ) -> ChosenPlan:  # fmt: skip
+        """Chooses how many digits an inverse needs, and begins its plan."""
+        planes = self._solver.planes_for(given.pattern, given.values)
+        plan = self._solver.begin_plan(body, given.pattern, planes)
+        return ChosenPlan(body, given, planes, plan, spare.get((given.pattern.id, planes)))
+
+    def _choose_and_build(
+        self, work: Sequence[tuple[int, GivenFactor, Mapping[InverseKind, InverseStorage | None]]],
+        made: Future[list[UploadedFactor | Exception]],
+    ) -> None:  # fmt: skip
+        """Begins to build inverses, in the thread of the plans: now, or behind their plans."""
+        try:
+            chosen = [self._chosen(*each) for each in work]
+        except Exception as error:
+            for _, given, _ in work:
+                given.tell(None)
+            made.set_result([error for _ in work])
+            return
+        if all(each.plan.done() for each in chosen):
+            self._end(chosen, made)
+        else:
+            self._solver.beside(partial(self._end, chosen, made))
+
+    def _end(self, chosen: Sequence[ChosenPlan], made: Future[list[UploadedFactor | Exception]]) -> None:
+        try:
+            made.set_result(self._build(chosen))
+        except BaseException as error:
+            made.set_exception(error)
+
+    def _build(self, chosen: Sequence[ChosenPlan]) -> list[UploadedFactor | Exception]:
+        """Begins to build inverses whose plans are made, those of one plan together."""
+        made: list[UploadedFactor | Exception] = [ValueError("not built")] * len(chosen)
+        try:
+            for plan in dict.fromkeys(each.plan for each in chosen):
+                places = [place for place, each in enumerate(chosen) if each.plan is plan]
+                try:
+                    self._build_by(plan.result(), chosen, places, made)
+                except Exception as error:
+                    for place in places:
+                        made[place] = error
+        finally:
+            for each in chosen:
+                each.given.tell(None)
+        return made
+
+    def _build_by(
+        self, planned: PlannedInverse, chosen: Sequence[ChosenPlan], places: Sequence[int],
+        made: list[UploadedFactor | Exception],
+    ) -> None:  # fmt: skip
+        """Fills in what is made at some places, each in a storage, a new one unless there is one to spare."""
+        storages: dict[int, InverseStorage] = {}  # by place
+        for place in places:
+            try:
+                spare = chosen[place].spare
+                storage = planned.builder.storage() if spare is None else spare
+                self._solver.reserve_vectors(chosen[place].body, planned.plan)
+                storages[place] = storage
+            except Exception as error:
+                made[place] = error
         self._gpu.cp.cuda.get_current_stream().synchronize()  # new arrays are complete for other streams
-        inverse = builder.build(given.values, storage, self._solver.spared)  # beside the steps
-        return UploadedFactor(inverse, storage, given.step, given.pattern)
+        builder, able, multiprocessors = planned.builder, list(storages), self._multiprocessors
+        for k in range(0, len(able), builder.most):
+            some = able[k : k + builder.most]
+            values = [chosen[place].given.values for place in some]
+            inverses = builder.build_many(values, [storages[place] for place in some], multiprocessors)
+            for place, inverse in zip(some, inverses, strict=True):
+                given, planes = chosen[place].given, chosen[place].planes
+                if given.r is not None:
+                    given.tell(builder.apply(inverse, given.r, multiprocessors))
+                made[place] = UploadedFactor(inverse, storages[place], given.step, given.pattern, planes)
 
-    def _finish(self, body: int, pattern: FactorPattern, build: Callable[[], UploadedFactor]) -> None:
-        """Posts the factor that `build` returns, or warns if it cannot be used."""
+    @property
+    def _multiprocessors(self) -> int | None:
+        """Multiprocessors that a build may keep busy: those that solves leave free; None: all, where steps in real time
+        leave the device idle most of the time. A step then waits some 100 us now and then, and the build is done the
+        sooner."""
+        loop = self._loop.loop
+        idle = loop.realtime and 0 < loop.step_seconds < BUSY * loop.dt
+        return None if idle else self._solver.spared
+
+    def _finish(self, builds: Builds) -> None:
+        """Posts what was built beside the caller."""
+        self._builds = [each for each in self._builds if each is not builds]
+        for body in builds.given:
+            self._uploads[body].building = None
+        errors = []
+        for (body, given), made in zip(builds.given.items(), builds.made.result(), strict=True):
+            try:
+                self._post(body, given, made)
+            except Exception as error:  # the others are posted all the same
+                errors.append(error)
+        if errors:
+            raise errors[0]
+
+    def _post(self, body: int, given: GivenFactor, made: UploadedFactor | Exception) -> None:
+        """Posts a factor, if it is wanted already, or warns if it cannot be used. Raises what is neither of the factor
+        nor lack of memory."""
         uploads = self._uploads[body]
         try:
-            factor = build()
-            self._keep(uploads, factor)
-            self._solver.use(body, pattern, factor.inverse, factor.step)
+            if isinstance(made, Exception):
+                raise made
+            self._keep(uploads, made)
+            if not given.wanted:
+                uploads.built = None if given.dropped else (made, given)
+                return
+            self._solver.use(body, given.pattern, made.inverse, made.planes, made.step)
         except (ValueError, CompileError) as error:
             self._warn(uploads, str(error))
             return
@@ -224,23 +476,35 @@ class FactorUpload:
                 raise
             self._warn(uploads, f"not enough GPU memory: {error}")
             return
-        uploads.posted = factor
+        self._tell(uploads, made.planes)
+        uploads.posted = made
         row = self._solver.bodies[body : body + 1].tobytes()[SETTINGS_BYTES:]
-        self._gpu.cp.cuda.get_current_stream().synchronize()  # arrays that `use` may have made are complete
-        uploads.mailbox.post(row, keep=factor, event=factor.inverse.event.ptr)
+        uploads.mail = uploads.mailbox.post(row, keep=made, event=made.inverse.event.ptr)
 
     def _keep(self, uploads: BodyUploads, factor: UploadedFactor) -> None:
-        """Keeps the storage of a factor, and forgets those of patterns that are not used any more."""
-        if factor.pattern.id not in uploads.storages:
-            in_use = uploads.in_use.pattern.id if uploads.in_use else None
-            for old in [k for k in uploads.storages if k != in_use]:
-                if len(uploads.storages) >= MAX_PATTERNS:
+        """Keeps the storage of a factor, and forgets those of kinds that are not used any more."""
+        if factor.kind not in uploads.storages:
+            in_use = uploads.in_use.kind if uploads.in_use else None
+            outdated = [k for k in uploads.storages if k != in_use]
+            for old in outdated:
+                if len(uploads.storages) >= MAX_KINDS:
                     del uploads.storages[old]
-            kept = {each for other in self._uploads for each in other.patterns}
-            self._solver.forget_plans({*kept, factor.pattern.id})
-        storages = uploads.storages.setdefault(factor.pattern.id, [])
+            if outdated or factor.kind not in self._known:
+                self._forget_plans(factor.kind)
+        storages = uploads.storages.setdefault(factor.kind, [])
         if all(storage is not factor.storage for storage in storages):
             storages.append(factor.storage)
+
+    def _forget_plans(self, needed: InverseKind) -> None:
+        """Forgets the plans of kinds that no body has. needed: one that is about to be used"""
+        self._known = {needed}.union(*(each.kinds(body) for body, each in enumerate(self._uploads)))
+        self._solver.forget_plans(self._known)
+
+    def _tell(self, uploads: BodyUploads, planes: int) -> None:
+        """Takes note of how many digits the inverse of a factor has, and logs it where that changes."""
+        if planes != uploads.planes:
+            uploads.planes = planes
+            log.info("object %r: its factors keep %d binary digits on the GPU from now on", uploads.name, 11 * planes)
 
     def _warn(self, uploads: BodyUploads, reason: str) -> None:
         if not uploads.warned:

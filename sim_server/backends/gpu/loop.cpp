@@ -116,6 +116,15 @@ static int64_t batch_size(GpuLoop& l, int64_t left) {
 // True if none of the next n - 1 steps is a multiple of `every`.
 static bool none_within(const GpuLoop& l, int64_t every, int64_t n) { return every <= 0 || every - l.launched % every >= n; }
 
+// The graph of most steps, `left` at most, after none of which but the last one something else is due.
+static int largest_graph(const GpuLoop& l, int64_t left) {
+    const int64_t frame_every = l.rings.frame_every.load(), energy_every = l.rings.energy_every.load();
+    int size = 0;
+    for (int k = 1; k < GRAPH_SIZES && l.sizes[k] <= left; ++k)
+        if (l.graphs[0][k] && none_within(l, frame_every, l.sizes[k]) && none_within(l, energy_every, l.sizes[k])) size = k;
+    return size;
+}
+
 static bool launch_batch(GpuLoop& l, int64_t steps) {
     if (!open_batch(l)) return false;
     if (l.begun == l.finished || done(l, l.batches[(l.begun - 1) % STEP_BATCHES].done)) {
@@ -123,15 +132,13 @@ static bool launch_batch(GpuLoop& l, int64_t steps) {
         l.idle_since = now();
     }
     for (int64_t left = steps; left > 0;) {
-        int64_t n = l.many;
-        bool undisturbed = none_within(l, l.rings.frame_every.load(), n) && none_within(l, l.rings.energy_every.load(), n);
-        bool wanted = l.requested.load(std::memory_order_relaxed) && l.matrix_step < 0;
-        if (!l.graphs[0][1] || left < n || !undisturbed || wanted || l.batches[l.begun % STEP_BATCHES].touched) n = 1;
+        const bool wanted = l.requested.load(std::memory_order_relaxed) && l.matrix_step < 0;
+        const int size = wanted || l.batches[l.begun % STEP_BATCHES].touched ? 0 : largest_graph(l, left);
         if (wanted && !begin_matrices(l, true)) return false;
-        CALL(graph_launch, l.graphs[l.ran_dry][n > 1], l.stream);
+        CALL(graph_launch, l.graphs[l.ran_dry][size], l.stream);
         l.ran_dry = 0;
-        if (!count(l, n)) return false;
-        left -= n;
+        if (!count(l, l.sizes[size])) return false;
+        left -= l.sizes[size];
     }
     return close_batch(l);
 }

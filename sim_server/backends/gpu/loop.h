@@ -75,12 +75,13 @@ struct StepBatch {                     // steps whose results are looked at toge
 struct FrameCopy { void *taken, *arrived; };  // events: copied on the device, copied to the host
 
 constexpr int STEP_BATCHES = 2, FRAME_COPIES = 4;  // under way at most
+constexpr int GRAPH_SIZES = 3;  // numbers of steps of which there are graphs
 
 struct GpuLoop {
     const CudaDriver* driver;
     void *context, *stream, *copy_stream;  // copy_stream: copies frames and matrices to the host
-    void* graphs[2][2];                    // [1: begins by writing the time, for an idle device][0: one step, 1: `many` steps or null]
-    int64_t many;
+    void* graphs[2][GRAPH_SIZES];          // [1: begins by writing the time, for an idle device][of `sizes` steps; null: there is none]
+    int64_t sizes[GRAPH_SIZES];            // 1, and then more and more
     MailSlot* mail_slots;
     BodyReadback* readbacks;               // (bodies,)
     int32_t mail_slot_count, bodies;

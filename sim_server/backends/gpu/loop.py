@@ -20,7 +20,7 @@ from sim_server.backends.ring_buffers import Reports
 from sim_server.errors import DeviceLost
 
 BATCH = 16  # most steps whose results are read together
-MANY = 8  # steps of the larger graph
+GRAPH_STEPS = (1, 2, 8)  # of which there are graphs
 CAPACITY = 64  # steps whose results are kept; more than can be under way
 FRAMES = 8  # in the ring
 BATCH_SECONDS = 2e-3  # aim for the duration of a batch [s]; requests wait for two batches at most
@@ -116,7 +116,8 @@ class DeviceLoop(Reports):
         loop.readbacks, loop.bodies = c.addressof(self._readbacks), bodies
         for name, address in addresses.items():
             setattr(loop, name, address)
-        loop.capacity, loop.batch, loop.many, loop.batch_seconds, loop.poll = CAPACITY, BATCH, MANY, BATCH_SECONDS, POLL
+        loop.capacity, loop.batch, loop.batch_seconds, loop.poll = CAPACITY, BATCH, BATCH_SECONDS, POLL
+        loop.sizes[:] = GRAPH_STEPS
         loop.frame_bytes, loop.clock, loop.matrix_step = frame, clock.ctypes.data, -1
         loop.frame_staging = device.memory(FRAME_COPIES * 2 * frame)
         loop.timestamps = timestamps.ctypes.data
@@ -183,13 +184,13 @@ class DeviceLoop(Reports):
     ) -> None:  # fmt: skip
         """Sets the handles of the CUDA graphs.
 
-        graphs: one step, MANY steps (0: none), then the same two beginning with the kernel that writes the time
+        graphs: of GRAPH_STEPS (0: none), then the same beginning with the kernel that writes the time
         records: for each of `targets`, settles the energy balance of the last step and writes the records asked for
         energy_balance: settles the energy balance of the last step
         elastic_energy: adds the elastic energy to it
         matrix: makes A of the next step, for a copy; 0: each step makes its own
         """
-        self.loop.graphs[0][:], self.loop.graphs[1][:] = graphs[:2], graphs[2:]
+        self.loop.graphs[0][:], self.loop.graphs[1][:] = graphs[: len(GRAPH_STEPS)], graphs[len(GRAPH_STEPS) :]
         for batch, graph in zip(self.loop.batches, records, strict=True):
             batch.records = graph
         self.loop.energy_balance, self.loop.elastic_energy = energy_balance, elastic_energy

@@ -20,6 +20,8 @@ from sim_server.backends.gpu.device import Gpu, compiled, options, own_headers
 from sim_server.backends.gpu.followed_rows import FollowedRows
 from sim_server.backends.gpu.inverse.build_inverse import InverseBuilder, PartitionedInverse, builder_kernels
 from sim_server.backends.gpu.inverse.device_plan import DevicePlan, shared_bytes
+from sim_server.backends.gpu.inverse.digits import library as digits_library
+from sim_server.backends.gpu.inverse.digits import planes_for
 from sim_server.backends.gpu.inverse.plan import plan
 from sim_server.backends.gpu.row_partition import SPARED, best_assignment, halo, initial_ranges, lists_of
 from sim_server.backends.gpu.structs import CONTACT, CORRECTION, PCG, PCG_RESULT, STAGES
@@ -39,11 +41,27 @@ class PlannedInverse(NamedTuple):
     builder: InverseBuilder
 
 
-def threads_and_blocks(nodes: Int64, processors: int) -> tuple[int, int]:
-    """Returns threads per thread block and thread blocks per multiprocessor. nodes (bodies,): of each body."""
+BLOCK_BYTES, NODE_BYTES, OTHER_BYTES = (
+    76,
+    216,
+    5120,
+)  # in shared memory: of a block of A, a node, and the rest (spmv.cuh)
+
+
+def threads_and_blocks(nodes: Int64, blocks: Int64, processors: int, shared: int) -> tuple[int, int]:
+    """Returns threads per thread block and thread blocks per multiprocessor.
+
+    Of many small bodies four are on a multiprocessor, but two if that is what it takes to have their rows of A in its
+    shared memory, which else pass through it in every iteration.
+
+    nodes, blocks (bodies,): of each body and of its rows of A. shared: bytes of a multiprocessor.
+    """
     if len(nodes) <= processors - SPARED:
         return 256, 1  # 255 registers a thread: spilling to local memory costs a trip to L2
-    return (64, 4) if len(nodes) > 2 * processors and np.median(nodes) < 300 else (128, 2)
+    if len(nodes) <= 2 * processors or np.median(nodes) >= 300:
+        return 128, 2
+    needed = np.median(BLOCK_BYTES * blocks + NODE_BYTES * nodes) + OTHER_BYTES
+    return (128, 2) if shared / 4 < needed <= shared / 2 else (64, 4)
 
 
 class PcgSolver:
@@ -53,7 +71,7 @@ class PcgSolver:
     arrays: host arrays by name (row_start, columns, values, b, y, moving); their twins on the device are used
     counter: device array (1,), number of completed steps
     capacity: number of steps whose results are kept
-    planes: float16 numbers per entry of an inverse; 1, or 2 for 22 bits
+    planes: float16 numbers per entry of an inverse; 1, or 2 for 22 bits; None: as each factor needs (digits.py)
     phases: NewtonPhases.of_solves (newton.py); empty: one linearization a step
     attempts: number of solves that the graph of a Rosenbrock-W step holds (stages.cuh); 0: another scheme
     contact: True for a scene with contact (contact_state.cuh)
@@ -74,9 +92,9 @@ class PcgSolver:
 
     def __init__(
         self, gpu: Gpu, ranges: Sequence[tuple[int, int]], arrays: Mapping[str, NDArray[Any]], counter: DeviceArray,
-        capacity: int, planes: int = 1, phases: Sequence[DeviceArray] = (), attempts: int = 0, contact: bool = False,
-        between: bool = False, correction: FactorCorrection | None = None, errors: bool = False, budgets: bool = False,
-        cut: CutInput | None = None,
+        capacity: int, planes: int | None = 1, phases: Sequence[DeviceArray] = (), attempts: int = 0,
+        contact: bool = False, between: bool = False, correction: FactorCorrection | None = None, errors: bool = False,
+        budgets: bool = False, cut: CutInput | None = None,
     ):  # fmt: skip
         cp, processors = gpu.cp, gpu.properties["multiProcessorCount"]
         self.gpu, self.counter, self._capacity, self.planes, self._phases = gpu, counter, capacity, planes, phases
@@ -90,7 +108,9 @@ class PcgSolver:
             self._types["local"] = gpu.types["local"]
         spans = np.array(ranges, np.int64)
         nodes = spans[:, 1] - spans[:, 0]
-        self.threads, blocks = threads_and_blocks(nodes, processors)
+        rows = np.diff(arrays["row_start"].astype(np.int64)[spans], axis=1)[:, 0]
+        shared = gpu.properties["sharedMemPerMultiprocessor"]
+        self.threads, blocks = threads_and_blocks(nodes, rows, processors, shared)
         assigned, most = best_assignment(nodes, processors, blocks)
         self.grid = most if assigned.pooled else int(assigned.blocks.sum())
         self.spared = processors - -(-self.grid // blocks)
@@ -134,8 +154,10 @@ class PcgSolver:
         self._application = self._compiled(application, blocks) if application else None
         self._device = cp.cuda.Device()
         self._planner = ThreadPoolExecutor(1, "plans of inverses")
+        if planes is None:
+            digits_library()  # before a factor waits for it
         self._lock = threading.Lock()
-        self._plans: dict[tuple[int, int], Future[PlannedInverse]] = {}  # by pattern and number of thread blocks
+        self._plans: dict[tuple[int, int, int], Future[PlannedInverse]] = {}  # by pattern, planes, thread blocks
         self._vectors: dict[tuple[int, int], dict[str, DeviceArray]] = {}  # by body and plan
         self._factor_bytes = [0] * len(ranges)
 
@@ -164,10 +186,11 @@ class PcgSolver:
         assert self.followed is not None
         return [(self._work[name], array) for name, array in self.followed.of(row_start, columns).items()]
 
-    def forget_plans(self, patterns: Collection[int]) -> None:
-        """Frees plans of factors of all but these patterns (FactorPattern.id), which no step may use any more."""
+    def forget_plans(self, kept: Collection[tuple[int, int]]) -> None:
+        """Frees plans of factors of all but these patterns (FactorPattern.id) and planes, which no step may use any
+        more."""
         with self._lock:
-            gone = [key for key, made in self._plans.items() if key[0] not in patterns and made.done()]
+            gone = [key for key, made in self._plans.items() if key[:2] not in kept and made.done()]
             made = [self._plans.pop(key) for key in gone]
         addresses = {each.result().plan.address for each in made if each.exception() is None}
         self._vectors = {key: made for key, made in self._vectors.items() if key[1] not in addresses}
@@ -246,6 +269,10 @@ class PcgSolver:
         """Has the kernels that build inverses compiled beside the caller, before a factor waits for them."""
         self.beside(lambda: builder_kernels(self.gpu))
 
+    def planes_for(self, pattern: FactorPattern, values: NDArray[Any]) -> int:
+        """Returns the float16 numbers per entry that the inverse of a factor gets. From any thread."""
+        return planes_for(pattern, values) if self.planes is None else self.planes
+
     def beside(self, work: Callable[[], T]) -> Future[T]:
         """Has work done in the thread of the plans, one after another."""
 
@@ -255,50 +282,57 @@ class PcgSolver:
 
         return self._planner.submit(on_device)
 
-    def begin_plan(self, body: int, pattern: FactorPattern) -> Future[PlannedInverse]:
+    def begin_plan(self, body: int, pattern: FactorPattern, planes: int | None = None) -> Future[PlannedInverse]:
         """Returns the plan of the inverse of factors of this pattern for a body, and its builder: at first, they are
-        made in a thread. Its result raises what `plan` raises."""
+        made in a thread. Its result raises what `plan` raises. planes: float16 numbers per entry; None: those of
+        usual factors"""
+        planes = planes or self.planes or 1
         blocks = int(self.bodies[body]["blocks"])
-        key = (pattern.id, blocks)
+        key = (pattern.id, planes, blocks)
         with self._lock:
             if key in self._plans:
                 return self._plans[key]
-            made = self._plans[key] = self.beside(lambda: self._planned(pattern, blocks))
+            made = self._plans[key] = self.beside(lambda: self._planned(pattern, blocks, planes))
         made.add_done_callback(partial(self._forget_failed, key))
         return made
 
-    def _forget_failed(self, key: tuple[int, int], made: Future[PlannedInverse]) -> None:
+    def _forget_failed(self, key: tuple[int, int, int], made: Future[PlannedInverse]) -> None:
         """Has a plan that could not be made tried again the next time: memory may be free then."""
         if made.exception() is not None:
             with self._lock:
                 if self._plans.get(key) is made:
                     del self._plans[key]
 
-    def _planned(self, pattern: FactorPattern, blocks: int) -> PlannedInverse:
-        found = plan(pattern, blocks, planes=self.planes, shared=self._shared)
+    def _planned(self, pattern: FactorPattern, blocks: int, planes: int) -> PlannedInverse:
+        found = plan(pattern, blocks, planes=planes, shared=self._shared)
         if (needed := shared_bytes(found)) > self._shared:
             raise ValueError(
                 f"{pattern.size} degrees of freedom in {blocks} thread blocks need {needed} bytes of shared memory "
                 f"each, allowed: {self._shared}"
             )
-        return PlannedInverse(DevicePlan(self.gpu, found, self.threads // 32), InverseBuilder(self.gpu, pattern, found))
+        alike = (3 * self.bodies["nodes"] == pattern.size) & (self.bodies["blocks"] == blocks)
+        builder = InverseBuilder(self.gpu, pattern, found, int(alike.sum()))
+        return PlannedInverse(DevicePlan(self.gpu, found, self.threads // 32), builder)
 
-    def plan(self, body: int, pattern: FactorPattern) -> DevicePlan:
+    def plan(self, body: int, pattern: FactorPattern, planes: int) -> DevicePlan:
         """Returns the plan of the inverse of factors of this pattern for a body; waits until it is made.
 
         Raises ValueError if the pattern has no plan (inverse.plan.plan) or needs more shared memory than there is.
         """
-        return self.begin_plan(body, pattern).result().plan
+        return self.begin_plan(body, pattern, planes).result().plan
 
-    def use(self, body: int, pattern: FactorPattern, inverse: PartitionedInverse, step: int) -> None:
+    def reserve_vectors(self, body: int, plan: DevicePlan) -> None:
+        """Allocates the vectors of solves of a body with factors of this plan, unless they are there."""
+        if (key := (body, plan.address)) not in self._vectors:
+            self._vectors[key] = plan.vectors()
+
+    def use(self, body: int, pattern: FactorPattern, inverse: PartitionedInverse, planes: int, step: int) -> None:
         """Writes a factor into the host row of a body; it is in use once the row is uploaded."""
-        device_plan, row = self.plan(body, pattern), self.bodies[body]
+        device_plan, row = self.plan(body, pattern, planes), self.bodies[body]
         row["plan"], row["matrix"], row["scale"] = device_plan.address, inverse.matrix, inverse.scale
-        row["planes"], row["factor_step"] = self.planes, step
-        key = (body, device_plan.address)
-        if key not in self._vectors:
-            self._vectors[key] = device_plan.vectors()
-        for name, array in self._vectors[key].items():
+        row["planes"], row["factor_step"] = planes, step
+        self.reserve_vectors(body, device_plan)
+        for name, array in self._vectors[body, device_plan.address].items():
             row[name] = array.data.ptr
         self._factor_bytes[body] = device_plan.bytes
 

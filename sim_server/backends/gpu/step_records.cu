@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: MIT
 // Writes the records of a batch of steps into the ring of the host, which its loop then completes by what only it knows (loop.cpp).
-// They lie one behind the other there, so that the writes of a warp travel together.
+// They lie one behind the other there, so that the writes of a warp, 256 bytes from a multiple of that on, travel together.
 #include "energy_record.cuh"
 #include "step_record.cuh"
 #include "step_results.cuh"
@@ -45,7 +45,9 @@ extern "C" __global__ void __launch_bounds__(THREADS) write_records(const StepRe
             memcpy(words + k * WORDS, &record, sizeof record);
         }
         __syncthreads();
-        for (int k = threadIdx.x; k < here * WORDS; k += THREADS) {
+        const int before = (place + from) * WORDS % 32;  // words of the ring since the last multiple of 256 bytes
+        for (int k = (int)threadIdx.x - before; k < here * WORDS; k += THREADS) {
+            if (k < 0) continue;
             long long at = place + from + k / WORDS;
             if (at >= a.room) at -= a.room;
             ((long long*)(a.records + at))[k % WORDS] = words[k];

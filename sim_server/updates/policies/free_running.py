@@ -27,7 +27,6 @@ if TYPE_CHECKING:
     from sim_server.updates.driver import Driver
 
 MAX_REQUESTS = 64  # matrices that the loop may be asked to copy within one step
-MAX_WAIT = 2  # steps that a copied matrix may wait for a worker
 
 
 class Async(UpdatePolicy):
@@ -39,6 +38,7 @@ class Async(UpdatePolicy):
         super().__init__(driver, n)
         self.prefetch = PrefetchDepth()
         self._exhausted = -1  # step at which no body was left to be asked for its matrix
+        self._newest_copy: BodyUpdateState | None = None  # that is there
         self._choice_due = 0.0  # s; time before which `pump` chooses no bodies
 
     def step(self) -> None:
@@ -50,7 +50,7 @@ class Async(UpdatePolicy):
         """Makes an exchange with the workers and adapts the prefetch depth to the time of steps."""
         driver = self.driver
         if self.prefetch.on_step(driver.engine.step, time.monotonic()) and not driver.counted:
-            self.prefetch.update(driver.table.cost, driver.source.worker_count())
+            self.prefetch.update(driver.table.cost, driver.source.worker_count(), driver.source.queues_jobs())
         self._exchange_copies()
         if (begin := time.monotonic()) >= self._choice_due:
             self._choose()  # of a thousand bodies it takes milliseconds: half of the time is kept for all else
@@ -127,14 +127,20 @@ class Async(UpdatePolicy):
         """Sends copies to idle workers in the order of the requests. With a prefetch depth others wait their turn."""
         driver = self.driver
         copied = driver.snapshots.completed()
+        if copied and copied[-1] is not self._newest_copy:
+            self._newest_copy = copied[-1]
+            self.prefetch.on_copy(time.monotonic() - copied[-1].job.requested)
         idle = driver.source.ready() if copied else 0
         made: list[tuple[BodyUpdateState, Job]] = []
         for state in copied:
             waited = driver.engine.step - driver.snapshots.step(state)
-            if idle <= len(made) and self.prefetch.depth and waited <= MAX_WAIT:
+            if idle <= len(made) and self.prefetch.depth:
+                if waited > self.prefetch.patience:
+                    driver.snapshots.discard(state)
                 continue
             if (job := driver.make_job(state)) is not None:
                 made.append((state, job))
+        self.prefetch.on_sent(len(made), time.monotonic())
         if not made:
             return
         for (state, job), taken in zip(made, driver.source.submit_many([job for _, job in made]), strict=True):

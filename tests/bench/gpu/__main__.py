@@ -22,7 +22,8 @@ from tests.bench.gpu import page
 from tests.bench.gpu.problem import BARS, BATCHES, MATERIALS, Problem
 from tests.bench.harness.report import Report
 
-SECTIONS = ("steps", "batches", "others", "served", "linearizations")
+SECTIONS = ("steps", "batches", "others", "served", "realtime", "linearizations")
+REAL_TIME, REAL_DT = (24_000, 98_304), 0.01  # sizes; s
 ROUNDS = {540: 20, 3000: 20, 7350: 20, 24_000: 12, 98_304: 6, 405_600: 3, 1_029_000: 2}
 WITHOUT = {540: 4, 3000: 4, 7350: 2, 24_000: 2, 98_304: 2, 405_600: 1, 1_029_000: 1}  # steps of CG in each round
 
@@ -89,6 +90,15 @@ def trial(tets: int, o: argparse.Namespace) -> Rows:
     return [found]
 
 
+def in_real_time(tets: int, o: argparse.Namespace) -> dict[str, Any]:
+    """Row of a server in real time with a worker on the same GPU."""
+    from tests.bench.gpu.first_factor import measure as real_time
+
+    row = real_time(tets, seconds=2.0 if o.quick else 4.0, dt=REAL_DT)
+    print(row, flush=True)
+    return row
+
+
 def measure(o: argparse.Namespace) -> dict[str, Rows]:
     """All sections asked for, and what the device is."""
     from tests.bench.gpu.cudss import version
@@ -115,6 +125,10 @@ def measure(o: argparse.Namespace) -> dict[str, Rows]:
                 rows, publishing = guarded(problem.name, lambda: served(problem, 1.0, overrides=tuple(o.set)))  # noqa: B023
                 data["served"] += rows
                 data["publishing"] += publishing
+    for tets in o.sizes if "realtime" in o.only else ():
+        if tets in REAL_TIME:
+            rows, _ = guarded(f"{tets} tets in real time", lambda: ([in_real_time(tets, o)], []))  # noqa: B023
+            data["realtime"] += rows
     for tets in o.sizes if "linearizations" in o.only else ():
         if tets in SEARCHED:
             made = guarded(f"{tets} tets", lambda: (searches(tets, o), trial(tets, o)))  # noqa: B023

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""How long a server on a GPU goes without a factor, and how long clients wait for answers meanwhile.
+"""How long a server on a GPU goes without a factor, how old factors are later, and how long clients wait for answers.
 
 A server of its own runs a beam in real time with one worker on the same GPU. A client asks for a status all the time
 from when the server answers a command for the first time. Kernels and orders of elimination are in their caches if an
-earlier run has put them there.
+earlier run has put them there. A short time step tells more closely after what time a factor is in use.
 """
 
 import argparse
@@ -12,6 +12,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,7 @@ import numpy as np
 
 from clients.client import Client
 from clients.errors import ClientError
+from protocol import messages_pb2 as pb
 from tests.bench.gpu.problem import Problem
 from tests.ports import free_endpoint
 
@@ -27,32 +29,36 @@ PATIENCE = 90.0  # s
 Row = dict[str, Any]
 
 
-def measure(tets: int, first: str = "go", device: str = "gpu", worker: str = "gpu", seconds: float = 10.0) -> Row:
+def measure(
+    tets: int, first: str = "go", device: str = "gpu", worker: str = "gpu", seconds: float = 10.0, dt: float = 0.03
+) -> Row:  # fmt: skip
     """Runs a server for some seconds after its first answer, in real time.
 
     first: solver.first_factor. Returns: steps and seconds until a step used a factor; of the status queries the number,
-    how many failed, and the longest [ms]; of the factors in the last half their number a second and mean age [steps]
+    how many failed, and the longest [ms]; of the factors in the last half their number a second, mean age [steps] and
+    time from the step of the matrix to the first step that uses it [ms]; times of the steps in that half [ms]
     """
     with tempfile.TemporaryDirectory() as folder:
-        scene, endpoint = Problem(tets).write(Path(folder)), free_endpoint()
+        scene, endpoint = Problem(tets, dt=dt).write(Path(folder)), free_endpoint()
         server = subprocess.Popen(
             [sys.executable, "-m", "sim_server", str(scene), "--device", device, "--realtime", "--workers", "1",
              "--worker-device", worker, "--listen", endpoint, "--set", f"solver.first_factor={first}"],
             stdout=sys.stderr,
         )  # fmt: skip
         try:
-            return {"tets": tets, "first factor": first, **_watched(endpoint, seconds)}
+            return {"tets": tets, "worker": worker, "dt": dt, "first factor": first, **_watched(endpoint, seconds, dt)}
         finally:
             server.terminate()
             server.wait(30)
 
 
-def _watched(endpoint: str, seconds: float) -> Row:
+def _watched(endpoint: str, seconds: float, dt: float) -> Row:
     client = _client(endpoint)
     with client:
         _answering(client)
-        begun, used, waits, failed, ages = time.monotonic(), None, [], 0, []
-        factors: list[tuple[float, int]] = []
+        begun, used, waits, failed = time.monotonic(), None, [], 0
+        half = begun + seconds / 2
+        subscribed, steps = client.steps(), list[pb.ObjectStep]()
         step_of_use = -1
         while (now := time.monotonic()) < begun + seconds or (used is None and now < begun + PATIENCE):
             try:
@@ -66,20 +72,31 @@ def _watched(endpoint: str, seconds: float) -> Row:
             beam = status.objects[0]
             if used is None and beam.factor_age_max >= 0:
                 used, step_of_use = time.monotonic() - begun, int(status.step)
-            factors.append((time.monotonic(), int(beam.factors_used)))
-            if time.monotonic() > begun + seconds / 2 and beam.last.factor_age >= 0:
-                ages.append(int(beam.last.factor_age))
+            new = subscribed.new()
+            steps += new if time.monotonic() > half else []
             time.sleep(0.005)
-        late = [f for f in factors if f[0] > begun + seconds / 2]
-        rate = (late[-1][1] - late[0][1]) / (late[-1][0] - late[0][0]) if len(late) > 1 else 0.0
         milliseconds = 1e3 * np.array(waits)
         return {
             "in use s": used, "in use step": step_of_use, "queries": len(waits), "failed": failed,
             "answer ms p50": float(np.percentile(milliseconds, 50)), "answer ms max": float(milliseconds.max()),
-            "factors/s": rate, "factor age": float(np.mean(ages)) if ages else None,
-            "step ms p50": 1e3 * status.step_p50, "step ms p99": 1e3 * status.step_p99,
-            "step ms max": 1e3 * status.step_max, "late steps": int(status.late_steps),
+            **_of_steps(steps, dt), "late steps": int(status.late_steps),
         }  # fmt: skip
+
+
+def _of_steps(steps: Sequence[pb.ObjectStep], dt: float) -> Row:
+    """Sums up steps that follow one another in real time, so that their numbers tell when they began."""
+    aged = [step for step in steps if step.factor_age >= 0]
+    if not aged:
+        return {}
+    first = {step.factor_step: step for step in reversed(aged)}
+    new = [1e3 * dt * step.factor_age for step in list(first.values())[::-1][1:]]
+    whole = 1e3 * np.array([step.step_seconds for step in aged])
+    p50, p99 = np.percentile(whole, [50, 99]).tolist()
+    return {
+        "factors/s": len(new) / (dt * len(aged)), "factor age": float(np.mean([step.factor_age for step in aged])),
+        "in use after ms": float(np.median(new)) if new else None, "at most ms": max(new, default=None),
+        "step ms p50": p50, "step ms p99": p99, "step ms max": float(whole.max()),
+    }  # fmt: skip
 
 
 def _answering(client: Client) -> None:
@@ -112,9 +129,11 @@ def main() -> None:
     parser.add_argument("--device", default="gpu")
     parser.add_argument("--worker", default="gpu")
     parser.add_argument("--seconds", type=float, default=10.0)
+    parser.add_argument("--dt", type=float, default=0.03, help="[s]")
     options = parser.parse_args()
     for tets in options.tets:
-        print(json.dumps(measure(tets, options.first, options.device, options.worker, options.seconds)), flush=True)
+        row = measure(tets, options.first, options.device, options.worker, options.seconds, options.dt)
+        print(json.dumps(row), flush=True)
 
 
 if __name__ == "__main__":

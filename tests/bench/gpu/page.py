@@ -14,6 +14,7 @@ KEYS = {  # what tells rows of a section apart
     "others": ("tets", "material", "what", "settings"),
     "served": ("tets", "material", "worker", "settings"),
     "publishing": ("tets", "material", "matrices", "settings"),
+    "realtime": ("tets", "worker", "dt", "settings"),
     "linearizations": ("tets", "tolerance", "linearizations", "needed", "settings"),
     "trial": ("tets", "settings"),
 }
@@ -49,6 +50,12 @@ OTHERS = (
 SERVED = (
     "Matrices and factors over shared memory, one worker, as fast as it goes; the beam is put back to its start every "
     "100 steps so that it keeps swinging. Residual: as the solver reports it."
+)
+IN_TIME = (
+    "A server of its own with one worker process on the same GPU, over shared memory; homogeneous, in steps of 10 ms, "
+    "in real time. First: from the first answer of the server until a step used a factor. Then, in the second half of "
+    "the run: factors a second, their age, and the time from the beginning of the step whose matrix is factorized to "
+    "the beginning of the first step with its factor (told in whole steps); steps. Answer: of a status query meanwhile."
 )
 SEARCHED = (
     "The same beam of stable Neo-Hookean material, dt 20 ms, E 1 MPa, with as many linearizations as the scene "
@@ -93,6 +100,7 @@ def write(report: Report, data: Data) -> None:
     for section, title, words in (
         ("others", "Others on the same matrices", OTHERS), ("served", "With a worker process", SERVED),
         ("publishing", "Steps with and without matrices leaving the device", PUBLISHED),
+        ("realtime", "In real time, with a worker process on the same GPU", IN_TIME),
     ):  # fmt: skip
         if data[section]:
             report.say(f"## {title}", words)

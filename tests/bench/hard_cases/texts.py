@@ -48,7 +48,7 @@ EFFECTS = """\
 
 Each seed has other masses, places or strengths (tests/hard_cases/effect_table.py, recipe_table.py). Numbers are finite,
 steps are solved or say how they ended, and the figure of *must hold* is at most what stands there; *worst*: of all
-seeds; *cost*: over the same scene without what is done to it."""
+seeds; *cost*: over the same scene made easy, or without what is done to it."""
 MODELS = """\
 ## The deformation models
 
@@ -141,22 +141,9 @@ EXTREME_ROWS = [
     )
 ]
 
-ELEVEN_BITS = (
-    'The inverse of a factor has 11 binary digits there by default, and 22 with factor_precision = "float32" (the case '
-    "of that name). Rounded likewise on a processor it takes 22 to 27 iterations for stiffness 1e6 side by side (8 to "
-    "10 with 22 digits, or exact) and 73 for Poisson 0.4999 (7): `tests/solver/test_partitioned_inverse.py`. "
-)
 ON_A_GPU = {  # why cases do not hold there
-    "stiffness 1e6 side by side": ELEVEN_BITS + "The answer is the same.",
-    "Poisson 0.4999": ELEVEN_BITS
-    + "Such a factor is dropped for block Jacobi, as the statuses tell. In the runs shown "
-    "mixed and single precision took its weight, which is below the rounding of the forces, for rest with seed 0: "
-    "since then a load that no step has solved for is solved for, which has not run on a GPU yet.",
     "struck by a tool": "In the second step the passes of contact run out on both devices; the state that a GPU then "
     "takes is crushed more, and the steps after it end likewise. Each says so; in float32 it runs away and is frozen.",
-    "stiffness 1e4: neo_hookean, regularized": "Energies of elements were of single precision in these runs: those of "
-    "a part 1e4 times as stiff are then known to less than what the soft one dissipates, also on a processor. They are "
-    "of double precision since, which has not run on a GPU yet. All else holds.",
     "inside out: corotational, patch": "It came back a little later than had to be then.",
     "inside out, symmetric mesh": "Rounding decides, and is another one there. These runs had to come back straight.",
 }

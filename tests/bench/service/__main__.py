@@ -26,17 +26,18 @@ from tests.bench.service.paced import Served
 
 TITLE = "What the service thread takes in"
 SIZES = (64, 256, 512, 1024)
-FIRST = 150.0  # s until measuring begins, though not every beam has had a factor
+FIRST = 150.0  # s until measuring begins, though not every beam has had two factors
 KEYS = ("name", "objects", "begun")
 COLUMNS = ("name", "objects", "factors/s", "us a factor", "calls a factor", "factors a round", "busy", "steps/s",
-           "age p50", "age p99", "age max")  # fmt: skip
+           "age p50", "age p99", "age max", "of a beam")  # fmt: skip
 WORDS = """Beams of {tets} tetrahedra at {rate:g} steps a second. The loop is a stand-in that reports solves, whose
 iterations grow with the age of the factor, and copies matrices; the worker, a process of its own, answers each matrix
 at once with the factor that it has made of it before. Driver, network, shared memory, checks and mailboxes are the
 product's. *us a factor*: processor time of the service thread, all that it does in its rounds but for the stand-in,
 over the factors that the loop was given. *calls a factor*: calls of Python functions in it, which do not depend on the
 machine. *busy*: part of the time in which the thread has a processor. Age: of the factor of a solve [steps],
-from when every beam has had one: the oldest are of beams that waited for the others meanwhile. Several
+from when every beam has had two, so that none waits for the others to get their first one. *of a beam*: factors that a
+beam was given meanwhile, the least and the most of all beams. Several
 rounds of one size follow one another; the median by *us a factor* is shown, and the least and largest beside it."""
 
 Row = dict[str, Any]
@@ -45,17 +46,17 @@ Row = dict[str, Any]
 def measure(objects: int, tets: int, rate: float, seconds: float, name: str) -> Row:
     """A row: measured for `seconds`, then half as long with calls counted."""
     with Served(objects, tets, rate) as served:
-        states, loop = served.driver.bodies, served.loop
+        used, loop = served.driver.table.used, served.loop
         end = time.monotonic() + FIRST
-        while any(state.factors.used == 0 for state in states) and time.monotonic() < end:
+        while used.min() < 2 and time.monotonic() < end:
             served.round()
-        rounds, found = 0, []
+        rounds, found, before = 0, [], used.copy()
         posted, spent, busy, begun, step = loop.posted, loop.spent, time.thread_time(), time.monotonic(), loop.step
         while time.monotonic() < begun + seconds:
             found.append(served.round())
             rounds += 1
         lasted, busy = time.monotonic() - begun, time.thread_time() - busy - (loop.spent - spent)
-        factors, steps = loop.posted - posted, loop.step - step
+        factors, steps, given = loop.posted - posted, loop.step - step, used - before
         calls = counted_calls(served, seconds / 2)
     r = np.concatenate(found)
     age = (r["step"] - 1 - r["factor_step"])[r["factor_step"] >= 0]
@@ -64,6 +65,7 @@ def measure(objects: int, tets: int, rate: float, seconds: float, name: str) -> 
         "us a factor": 1e6 * busy / max(factors, 1), "calls a factor": calls, "factors a round": factors / rounds,
         "busy": busy / lasted, "steps/s": steps / lasted, "age p50": float(np.percentile(age, 50)),
         "age p99": float(np.percentile(age, 99)), "age max": int(age.max()),
+        "of a beam": f"{given.min()} – {given.max()}",
     }  # fmt: skip
 
 

@@ -5,6 +5,7 @@ It shows what a server can take in, as a GPU that factorizes many matrices in on
 """
 
 import sys
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -46,9 +47,10 @@ class Remembering:
             self._known[key] = np.ascontiguousarray(self._made.factorize(values, dtype)).copy()
         return self._known[key]
 
-    def factorize_many(self, matrices: Any, dtype: Any) -> list[NDArray[Any]]:
+    def begin_many(self, matrices: Any, dtype: Any) -> Callable[[], list[NDArray[Any]]]:
         """As a GPU does with matrices of one pattern."""
-        return [self.factorize(values, dtype) for values in matrices]
+        made = [self.factorize(values, dtype) for values in matrices]
+        return lambda: made
 
 
 if __name__ == "__main__":

@@ -42,15 +42,14 @@ static bool sweep_obstacles(Passes& p) {
     return true;
 }
 
-// Sets those that y still takes into one back; returns the number of nodes.
+// Sets those that y still takes into one back; returns the number of nodes that are moved.
 static int hold_back(const Passes& p) {
-    int clipped = ObstacleSweep(p).clip();
-    for (int k = 0; k < HOLDS; ++k) {
-        const int faces = FaceSweep(p).clip();
-        if (!faces) break;
-        clipped += faces + ObstacleSweep(p).clip();
-    }
-    return clipped;
+    p.each_entry([&](int64_t k) { p.before[k] = p.y[k]; });
+    ObstacleSweep(p).clip();
+    for (int k = 0; k < HOLDS && FaceSweep(p).clip(); ++k) ObstacleSweep(p).clip();
+    int moved = 0;
+    p.each_entry([&](int64_t k) { moved += k % 3 == 0 && !std::equal(p.y + k, p.y + k + 3, p.before + k); });
+    return moved;
 }
 
 // The step of an island whose rows are detected; of a body alone as without contact where nothing is touched.

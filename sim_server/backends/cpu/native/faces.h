@@ -154,9 +154,9 @@ struct FaceSweep : IslandRows {
         return true;
     }
 
-    // Sets triangles that y takes into an obstacle back, to a part of the way; returns the number of their nodes.
-    int clip() const {
-        int clipped = 0;
+    // Sets triangles that y takes into an obstacle back, to a part of the way. Returns whether there are such.
+    bool clip() const {
+        bool found = false;
         for (int m = 0; m < count && c.face_start; ++m) {
             const BodyFaces faces(loop, c, motion_of(c, loop.x, y), bodies[m]);
             each_passage(faces, [&](int k, const FaceTouch& t, const NodeWay* const* ways, double time) {
@@ -168,10 +168,10 @@ struct FaceSweep : IslandRows {
                     place_before(c.obstacles, c.obstacle_count, t.obstacle, *ways[a], time, from, back, entry());
                     for (int l = 0; l < 3; ++l) dv[l] = (back[l] - from[l]) / c.dx_dv - c.predictor[3 * (int64_t)node + l];
                     rotated_back(c.rotation + 9 * (int64_t)node, dv, y + 3 * (int64_t)node);
-                    ++clipped;
+                    found = true;
                 }
             });
         }
-        return clipped;
+        return found;
     }
 };

@@ -103,19 +103,16 @@ struct ObstacleSweep : IslandRows {
         std::fill(c.traction + 3 * k, c.traction + 3 * k + 3, 0.0);
     }
 
-    // Sets points that y moves into an obstacle back, to a part of the way; returns their number.
-    int clip() const {
-        int clipped = 0;
+    // Sets points that y moves into an obstacle back, to a part of the way.
+    void clip() const {
         each_site([&](int k) {
             const int node = c.corner[CORNERS * k];
             double from[3], to[3], back[3], dv[3];
             if (c.free[node] == 0) return;
             path(k, from, to);
             if (!place_in_front(c.obstacles, c.obstacle_count, from, to, back, entry())) return;
-            ++clipped;
             for (int m = 0; m < 3; ++m) dv[m] = (back[m] - from[m]) / c.dx_dv - c.predictor[3 * (int64_t)node + m];
             rotated_back(c.rotation + 9 * (int64_t)node, dv, y + 3 * (int64_t)node);
         });
-        return clipped;
     }
 };

@@ -1,5 +1,6 @@
 // SPDX-License-Identifier: MIT
-// Builds the matrices of a plan (plan.py) from the values of L, all parts of a batch at once. GPU only.
+// Builds the matrices of a plan (plan.py) from the values of L, all parts of a batch at once. GPU only. Factors of one plan that are
+// there together are built in the same launches: each has matrices G and T of its own, and the tasks of one follow those of another.
 //
 // A part with v degrees of freedom inside and b in its boundary, both padded to 64, has a matrix G of v rows and v + b columns,
 // at first [L_VV^T | L_BV^T], in the order of L's columns. The diagonal blocks of 64 are inverted in place. Then neighbouring
@@ -11,6 +12,7 @@
 // keep few multiprocessors busy; many small ones end soon and leave room for more urgent work. All is float32, and every sum has
 // a fixed order, so results do not depend on the number of blocks or groups.
 constexpr int EDGE = 64;  // rows and columns of a tile
+constexpr int MOST_BUILDS = 64;  // inverses that are built in the same launches
 #define DEPTH 8          // rows of G that are in shared memory at a time
 #define THREADS 128      // of a group
 #define PITCH 65         // of a finished tile in shared memory
@@ -34,10 +36,27 @@ struct Column {                      // of L
 
 struct TileTask { int part, i, j, end; }; // tile in units of 64; end: of the first of two merged runs
 
-struct InverseStorage {                      // set before each build
+struct InverseStorage {
     unsigned short* matrix;  // (chunks, 8, 32)
     float* scale;            // (N + 1,)
 };
+
+struct Builds {              // set before each launch of the graph
+    int count, unused[3];    // inverses that are built
+    InverseStorage targets[MOST_BUILDS];
+};
+
+struct Strides {             // from one inverse to the next [entries]
+    long long value, g, t;   // values of L, G, T
+    long long first_t;       // of T of the first one, beyond part.t
+};
+
+__device__ __forceinline__ float* g_of(float* workspace, const Strides& s, const Part& part, int copy) {
+    return workspace + s.g * copy + part.g;
+}
+__device__ __forceinline__ float* t_of(float* workspace, const Strides& s, const Part& part, int copy) {
+    return workspace + s.first_t + s.t * copy + part.t;
+}
 
 // Threads of a block that do a task together. first, step: of the tasks that they take.
 template <int SIZE>
@@ -52,15 +71,18 @@ struct ThreadGroup {
 __device__ __forceinline__ int padded(int n, int step) { return (n + step - 1) / step * step; }
 
 // Values into G, a warp per column. place: column in its part's G of each entry of L's row lists. begin: the first batch.
-KERNEL_OF(1024) scatter(const Part* parts, const Column* columns, int first, int last, const int* place,
-                           const float* values, float* workspace, int begin, int scale_end, const InverseStorage* target) {
-    if (begin && blockIdx.x == 0 && threadIdx.x == 0) target->scale[scale_end] = 0;
+KERNEL_OF(1024) scatter(const Part* parts, const Column* columns, int count, const int* place, const float* values,
+                           float* workspace, Strides strides, int begin, int scale_end, const Builds* builds) {
+    const int copies = builds->count;
+    if (begin && blockIdx.x == 0)
+        for (int k = threadIdx.x; k < copies; k += blockDim.x) builds->targets[k].scale[scale_end] = 0;
     ThreadGroup<32> warp;
-    for (int c = first + warp.first; c < last; c += warp.step) {
-        const Column column = columns[c];
+    for (int c = warp.first; c < copies * count; c += warp.step) {
+        const int copy = c / count;
+        const Column column = columns[c % count];
         const Part part = parts[column.part];
-        float* row = workspace + part.g + (long long)column.within * part.pitch_g;
-        const float* value = values + column.value;
+        float* row = g_of(workspace, strides, part, copy) + (long long)column.within * part.pitch_g;
+        const float* value = values + strides.value * copy + column.value;
         const int* to = place + column.row;
 #pragma unroll 4
         for (int k = warp.thread; k < column.length; k += 32) row[to[k]] = value[k];
@@ -68,15 +90,16 @@ KERNEL_OF(1024) scatter(const Part* parts, const Column* columns, int first, int
 }
 
 // Diagonal blocks: L^T in, L^-1 out. A thread has a column of the inverse in registers.
-KERNEL_OF(4 * EDGE) invert(const Part* parts, const TileTask* tasks, int count, float* workspace) {
+KERNEL_OF(4 * EDGE) invert(const Part* parts, const TileTask* tasks, int count, float* workspace, Strides strides, const Builds* builds) {
     ThreadGroup<EDGE> group;
     int j = group.thread;
     float(*rows)[EDGE] = (float(*)[EDGE])((float*)dynamic + group.index * EDGE * (EDGE + 1));   // of L^T
     float* pivots = rows[EDGE];
-    for (int t = group.first; t < count; t += group.step) {
-        const TileTask task = tasks[t];
+    const int copies = builds->count;
+    for (int t = group.first; t < copies * count; t += group.step) {
+        const TileTask task = tasks[t % count];
         const Part part = parts[task.part];
-        float* block = workspace + part.g + (long long)task.i * EDGE * part.pitch_g + task.i * EDGE + j;
+        float* block = g_of(workspace, strides, part, t / count) + (long long)task.i * EDGE * part.pitch_g + task.i * EDGE + j;
         int inside = part.v - task.i * EDGE;
         for (int i = 0; i < EDGE; i++) rows[i][j] = block[(long long)i * part.pitch_g];
         group.barrier();
@@ -190,28 +213,30 @@ struct Product {
 };
 
 // T = C Y1: tile (i, j) of a pair of runs j .. end, end .. i ..
-KERNEL_OF(5 * THREADS) couple(const Part* parts, const TileTask* tasks, int count, float* workspace) {
+KERNEL_OF(5 * THREADS) couple(const Part* parts, const TileTask* tasks, int count, float* workspace, Strides strides, const Builds* builds) {
     ThreadGroup<THREADS> group;
     float* shared = (float*)dynamic + group.index * SHARED;
-    for (int t = group.first; t < count; t += group.step) {
-        const TileTask task = tasks[t];
+    const int copies = builds->count;
+    for (int t = group.first; t < copies * count; t += group.step) {
+        const TileTask task = tasks[t % count];
         const Part part = parts[task.part];
-        const float* rows = workspace + part.g + (long long)task.j * EDGE * part.pitch_g;
+        const float* rows = g_of(workspace, strides, part, t / count) + (long long)task.j * EDGE * part.pitch_g;
         Product<false> product(group, shared);
         product.run({rows + task.i * EDGE, part.pitch_g}, {rows + task.j * EDGE, part.pitch_g}, (task.end - task.j) * EDGE);
-        product.store(workspace + part.t + (long long)task.i * EDGE * part.pitch_t + task.j * EDGE, part.pitch_t, 1);
+        product.store(t_of(workspace, strides, part, t / count) + (long long)task.i * EDGE * part.pitch_t + task.j * EDGE, part.pitch_t, 1);
     }
 }
 
 // X = -Y2 T.
-KERNEL_OF(5 * THREADS) merge(const Part* parts, const TileTask* tasks, int count, float* workspace) {
+KERNEL_OF(5 * THREADS) merge(const Part* parts, const TileTask* tasks, int count, float* workspace, Strides strides, const Builds* builds) {
     ThreadGroup<THREADS> group;
     float* shared = (float*)dynamic + group.index * SHARED;
-    for (int t = group.first; t < count; t += group.step) {
-        const TileTask task = tasks[t];
+    const int copies = builds->count;
+    for (int t = group.first; t < copies * count; t += group.step) {
+        const TileTask task = tasks[t % count];
         const Part part = parts[task.part];
-        float* row = workspace + part.g + (long long)task.i * EDGE * part.pitch_g;
-        const float* coupled = workspace + part.t + (long long)task.end * EDGE * part.pitch_t + task.j * EDGE;
+        float* row = g_of(workspace, strides, part, t / count) + (long long)task.i * EDGE * part.pitch_g;
+        const float* coupled = t_of(workspace, strides, part, t / count) + (long long)task.end * EDGE * part.pitch_t + task.j * EDGE;
         Product<true> product(group, shared);
         product.run({row + task.end * EDGE, part.pitch_g}, {coupled, part.pitch_t}, (task.i + 1 - task.end) * EDGE);
         product.store(row + task.j * EDGE, part.pitch_g, -1);
@@ -219,20 +244,23 @@ KERNEL_OF(5 * THREADS) merge(const Part* parts, const TileTask* tasks, int count
 }
 
 // Scale: length of the columns of Y, 32 columns of a block of 64 at a time; the largest one goes to scale[scale_end].
-KERNEL_OF(4 * LENGTHS) lengths(const Part* parts, const TileTask* tasks, int count, const float* workspace, int scale_end,
-                           const InverseStorage* target) {
+KERNEL_OF(4 * LENGTHS) lengths(const Part* parts, const TileTask* tasks, int count, float* workspace, Strides strides,
+                             const Builds* builds, int scale_end) {
     ThreadGroup<LENGTHS> group;
     float(*sums)[32] = (float(*)[32])((float*)dynamic + group.index * LENGTHS);
-    float* scale = target->scale;
+    const int copies = builds->count;
     int lane = group.thread % 32, warp = group.thread / 32;
-    for (int t = group.first; t < 2 * count; t += group.step) {
-        const TileTask task = tasks[t / 2];
+    for (int t = group.first; t < 2 * copies * count; t += group.step) {
+        const int copy = t / 2 / count;
+        const TileTask task = tasks[t / 2 % count];
         const Part part = parts[task.part];
+        const float* g = g_of(workspace, strides, part, copy);
+        float* scale = builds->targets[copy].scale;
         int j = task.i * EDGE + t % 2 * 32 + lane;
         float sum = 0;
 #pragma unroll 4
         for (int k = task.i * EDGE + warp; k < part.v; k += LENGTHS / 32) {
-            float y = workspace[part.g + (long long)k * part.pitch_g + j];
+            float y = g[(long long)k * part.pitch_g + j];
             sum += y * y;
         }
         sums[warp][lane] = sum;
@@ -291,18 +319,19 @@ __device__ __forceinline__ void store(int thread, float (*tile)[PITCH], float si
 
 // Tile (i, j) of [Y^T Y | Y^T L_BV^T] into the storage: twice, since the inverse is symmetric and the coupling is applied
 // both ways. row_chunk (N / 8,), out_chunk (contributions / 8,): first chunk of each 8 rows.
-KERNEL_OF(5 * THREADS) finish(const Part* parts, const TileTask* tasks, int count, const float* workspace, const int* boundary,
-                          const int* row_chunk, const int* out_chunk, int planes, const InverseStorage* target) {
+KERNEL_OF(5 * THREADS) finish(const Part* parts, const TileTask* tasks, int count, float* workspace, Strides strides,
+                            const Builds* builds, const int* boundary, const int* row_chunk, const int* out_chunk, int planes) {
     ThreadGroup<THREADS> group;
     float* shared = (float*)dynamic + group.index * SHARED;
     float(*tile)[PITCH] = (float(*)[PITCH])shared;   // after the product
     float *down = shared + SHARED - 2 * EDGE, *across = down + EDGE;
-    const InverseStorage to = *target;
-    for (int t = group.first; t < count; t += group.step) {
-        const TileTask task = tasks[t];
+    const int copies = builds->count;
+    for (int t = group.first; t < copies * count; t += group.step) {
+        const TileTask task = tasks[t % count];
         const Part part = parts[task.part];
+        const InverseStorage to = builds->targets[t / count];
         int i = task.i * EDGE, j = task.j * EDGE, inside = padded(part.v, EDGE), edge = j - inside;
-        const float* rows = workspace + part.g + (long long)i * part.pitch_g;
+        const float* rows = g_of(workspace, strides, part, t / count) + (long long)i * part.pitch_g;
         Product<false> product(group, shared);
         product.run({rows + i, part.pitch_g}, {rows + j, part.pitch_g}, inside - i);
         for (int k = group.thread; k < EDGE; k += THREADS) {

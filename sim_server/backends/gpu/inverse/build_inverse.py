@@ -1,24 +1,39 @@
 # SPDX-License-Identifier: MIT
 """Builds the partitioned inverse (plan.py) from the values of L on the device, beside the running steps.
 
-A build is one copy from pinned memory and one launch of a graph of the kernels in build_inverse.cu. Memory is allocated
-only when an InverseBuilder or an InverseStorage is made.
+A build, of one factor or of several, is a copy or two from pinned memory and one launch of a graph of the kernels in
+build_inverse.cu. Memory is allocated only when an InverseBuilder or an InverseStorage is made.
 """
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from protocol.factor import FactorPattern
+from sim_server.arrays import Float64
 from sim_server.backends.gpu.cupy_types import DeviceArray, Event, Graph, KernelFunction
-from sim_server.backends.gpu.device import Gpu
-from sim_server.backends.gpu.inverse.expansion_batches import EDGE, BuildBatch, workspace_layout
+from sim_server.backends.gpu.device import Gpu, no_memory_left
+from sim_server.backends.gpu.inverse.apply_inverse import Applied, InverseApplication, application_kernels
+from sim_server.backends.gpu.inverse.expansion_batches import (
+    BUILDS,
+    COLUMN,
+    EDGE,
+    INVERSE_STORAGE,
+    MOST_BUILDS,
+    STRIDES,
+    WORKSPACE,
+    BuildBatch,
+    workspace_layout,
+)
 from sim_server.backends.gpu.inverse.partition import COLUMNS, ROWS
 from sim_server.backends.gpu.inverse.plan import Plan
 from sim_server.backends.gpu.inverse.workspace import workspace
+from sim_server.backends.gpu.pinned import PinnedArray
 
-HEAD = 16  # bytes in front of the values: the two addresses of a storage
+HEAD = BUILDS.itemsize  # bytes in front of the values: struct Builds
+COUNTS = (1, 4, 16, MOST_BUILDS)  # of inverses, for which graphs are made
 Groups = tuple[int, int, int, int]
 """Of a kernel: threads and bytes of shared memory of a group of threads, groups in a small and in a large block."""
 TILES: Groups = (128, 4 * (EDGE * (EDGE + 1) + 2 * EDGE), 1, 5)
@@ -33,7 +48,8 @@ KERNELS: dict[str, Groups] = {
 
 
 def builder_kernels(gpu: Gpu) -> dict[str, KernelFunction]:
-    """Returns the kernels of build_inverse.cu by name, compiled. Raises CompileError."""
+    """Returns the kernels of build_inverse.cu by name, compiled, as is what applies inverses. Raises CompileError."""
+    application_kernels(gpu)
     return {name: gpu.module("backends/gpu/inverse/build_inverse.cu").function(name) for name in KERNELS}
 
 
@@ -58,9 +74,12 @@ class InverseStorage(NamedTuple):
 
 
 class InverseBuilder:
-    """Builds the inverses of factors with one pattern by one plan, for any number of bodies."""
+    """Builds the inverses of factors with one pattern by one plan, for any number of bodies.
 
-    def __init__(self, gpu: Gpu, pattern: FactorPattern, plan: Plan):
+    most: number that `build_many` takes at a time; smaller than the one given if the workspace would be too large
+    """
+
+    def __init__(self, gpu: Gpu, pattern: FactorPattern, plan: Plan, most: int = 1):
         cp = gpu.cp
         self.plan, self._gpu, self._nonzeros = plan, gpu, pattern.nonzeros
         self._layout = layout = workspace_layout(pattern, plan)
@@ -70,11 +89,22 @@ class InverseBuilder:
         self._row_chunk, self._out_chunk = cp.asarray(layout.row_chunk), cp.asarray(layout.out_chunk)
         self._tasks = [[cp.asarray(t) for t in (b.diagonal, b.finish, *b.merges)] for b in layout.batches]
         self._workspace = workspace(cp.cuda.Device().id)
-        self._workspace.reserve(layout.size, HEAD + 4 * self._nonzeros)
+        self.most = self._reserve(max(1, min(most, MOST_BUILDS, WORKSPACE // layout.size)))
         self._functions = builder_kernels(gpu)
-        self._graphs: dict[int | None, Graph] = {}
+        self._application: InverseApplication | None = None
+        self._graphs: dict[tuple[int | None, int], Graph] = {}
         self._generation = -1
         cp.cuda.get_current_stream().synchronize()  # the tables are there for the stream of builds, which does not wait
+
+    def _reserve(self, most: int) -> int:
+        """Has the workspace made for builds of several; returns how many, fewer if there is too little memory."""
+        try:
+            self._workspace.reserve(most * self._layout.size, HEAD + 4 * most * self._nonzeros)
+        except Exception as error:
+            if most == 1 or not no_memory_left(error):
+                raise
+            return self._reserve(1)
+        return most
 
     def storage(self) -> InverseStorage:
         """Allocates memory for one inverse, set to zero."""
@@ -94,64 +124,96 @@ class InverseBuilder:
         multiprocessors: largest number that the build keeps busy, for whole milliseconds; a launch that needs only the
             others runs beside it. None: all of them; a launch that needs all then waits some 100 us now and then.
         """
+        return self.build_many([values], [storage], multiprocessors)[0]
+
+    def build_many(
+        self, values: Sequence[NDArray[np.floating]], storages: Sequence[InverseStorage], multiprocessors: int | None
+    ) -> list[PartitionedInverse]:
+        """Begins to build the inverses of up to `most` factors in the same launches; otherwise as `build`.
+
+        Each has the same bits as if it were built alone.
+        """
         with self._workspace.lock:
-            return self._begin(values, storage, multiprocessors)
+            return self._begin(values, storages, multiprocessors)
+
+    def apply(self, inverse: PartitionedInverse, r: Float64, multiprocessors: int | None = None) -> Applied:
+        """Begins to apply an inverse that a build under way makes to r (n,); returns before it is complete."""
+        with self._workspace.lock:
+            if self._application is None:
+                self._application = InverseApplication(self._gpu, self.plan)
+            most = multiprocessors or self._gpu.properties["multiProcessorCount"]
+            return self._application.begin(inverse.matrix, inverse.scale, r, self._workspace.stream, most)
 
     def _begin(
-        self, values: NDArray[np.floating], storage: InverseStorage, multiprocessors: int | None
-    ) -> PartitionedInverse:  # fmt: skip
-        space, cp = self._workspace, self._gpu.cp
+        self, values: Sequence[NDArray[np.floating]], storages: Sequence[InverseStorage], multiprocessors: int | None
+    ) -> list[PartitionedInverse]:  # fmt: skip
+        space, cp, count = self._workspace, self._gpu.cp, len(values)
+        assert 0 < count <= self.most and count == len(storages)
         if space.copied is not None:
             space.copied.synchronize()
-        size = HEAD + 4 * self._nonzeros
-        addresses = storage.matrix.data.ptr, storage.scale.data.ptr
-        space.staging[:HEAD].view(np.uint64)[:] = addresses
-        space.staging[HEAD:size].view(np.float32)[:] = values
-        graph, stream = self._graph(multiprocessors), space.stream
-        cp.cuda.runtime.memcpyAsync(
-            space.incoming.data.ptr, space.staging.ctypes.data, size, cp.cuda.runtime.memcpyHostToDevice, stream.ptr
-        )
-        space.copied = stream.record()
+        head = space.staging[:HEAD].view(BUILDS)[0]
+        head["count"] = count
+        targets = [(s.matrix.data.ptr, s.scale.data.ptr) for s in storages]
+        head["targets"][:count] = np.array(targets, np.uint64).view(INVERSE_STORAGE).ravel()
+        size, first = HEAD + 4 * count * self._nonzeros, values[0]
+        graph, stream = self._graph(multiprocessors, next(c for c in COUNTS if c >= count)), space.stream
+        at, copy, kind = int(space.incoming.data.ptr), cp.cuda.runtime.memcpyAsync, cp.cuda.runtime.memcpyHostToDevice
+        pinned = isinstance(first, PinnedArray) and first.dtype == np.float32 and first.flags.c_contiguous
+        if count == 1 and pinned:
+            copy(at, space.staging.ctypes.data, HEAD, kind, stream.ptr)
+            copy(at + HEAD, first.ctypes.data, size - HEAD, kind, stream.ptr)
+        else:
+            for row, factor in zip(space.staging[HEAD:size].view(np.float32).reshape(count, -1), values, strict=True):
+                np.copyto(row, factor, casting="same_kind")
+            copy(at, space.staging.ctypes.data, size, kind, stream.ptr)
+        space.copied, space.source = stream.record(), first
         graph.launch(stream)
-        return PartitionedInverse(*addresses, stream.record())
+        done = stream.record()
+        return [PartitionedInverse(*addresses, done) for addresses in targets]
 
-    def _graph(self, limit: int | None) -> Graph:
-        """Returns the graph of a build that keeps at most `limit` multiprocessors busy."""
+    def _graph(self, limit: int | None, count: int) -> Graph:
+        """Returns the graph of a build of up to `count` inverses that keeps at most `limit` multiprocessors busy."""
         if self._generation != self._workspace.generation:  # graphs hold its addresses
             self._graphs, self._generation = {}, self._workspace.generation
-        if limit not in self._graphs:
+        if (limit, count) not in self._graphs:
             stream = self._workspace.stream
             with stream:
                 stream.begin_capture()
                 try:
                     for number, batch in enumerate(self._layout.batches):
-                        self._batch(number, batch, limit)
+                        self._batch(number, batch, limit, min(count, self.most))
                 finally:
                     graph = stream.end_capture()
-                self._graphs[limit] = graph
-        return self._graphs[limit]
+                self._graphs[limit, count] = graph
+        return self._graphs[limit, count]
 
-    def _batch(self, number: int, batch: BuildBatch, limit: int | None) -> None:
-        """Launches the kernels that build the parts of a batch."""
+    def _batch(self, number: int, batch: BuildBatch, limit: int | None, copies: int) -> None:
+        """Launches the kernels that build the parts of a batch, of up to so many inverses."""
         space, parts, last = self._workspace, self._parts, np.int32(self.plan.size)
-        memory, target = (np.uint64(a.data.ptr) for a in (space.memory, space.incoming))
+        memory, builds = (np.uint64(a.data.ptr) for a in (space.memory, space.incoming))
         diagonal, finish, *merges = self._tasks[number]
+        strides = np.zeros((), STRIDES)
+        strides["value"], strides["g"], strides["first_t"] = self._nonzeros, batch.cleared // 4, 0
+        if copies > 1:  # then there is one batch: G of all, then T of all
+            strides["t"] = (self._layout.size - batch.cleared) // 4
+            strides["first_t"] = (copies - 1) * (batch.cleared // 4)
 
         def launch(name: str, tasks: DeviceArray, *more: Any) -> None:
-            self._launch(name, limit, len(tasks), parts, tasks, np.int32(len(tasks)), memory, *more)
+            count = np.int32(len(tasks))
+            self._launch(name, limit, copies * len(tasks), parts, tasks, count, memory, strides, builds, *more)
 
-        self._gpu.cp.cuda.runtime.memsetAsync(int(memory), 0, batch.cleared, space.stream.ptr)
+        self._gpu.cp.cuda.runtime.memsetAsync(int(memory), 0, copies * batch.cleared, space.stream.ptr)
+        columns, count = np.uint64(self._columns.data.ptr + COLUMN.itemsize * batch.first), batch.last - batch.first
         self._launch(
-            "scatter", limit, batch.last - batch.first, parts, self._columns, np.int32(batch.first),
-            np.int32(batch.last), self._place, np.uint64(target + HEAD), memory, np.int32(number == 0), last, target,
+            "scatter", limit, copies * count, parts, columns, np.int32(count), self._place, np.uint64(builds + HEAD),
+            memory, strides, np.int32(number == 0), last, builds,
         )  # fmt: skip
         launch("invert", diagonal)
         for tasks in merges:
             launch("couple", tasks)
             launch("merge", tasks)
-        launch("lengths", diagonal, last, target)
-        tables = (self._boundary, self._row_chunk, self._out_chunk)
-        launch("finish", finish, *tables, np.int32(self.plan.planes), target)
+        launch("lengths", diagonal, last)
+        launch("finish", finish, self._boundary, self._row_chunk, self._out_chunk, np.int32(self.plan.planes))
 
     def _launch(self, name: str, limit: int | None, tasks: int, *arguments: Any) -> None:
         if tasks == 0:

@@ -22,7 +22,10 @@ INVERSE = Declarations("backends/gpu/inverse/build_inverse.cu")
 EDGE: int = INVERSE.constant("EDGE")  # rows and columns of a tile of the kernels
 WORKSPACE = 256 << 20  # bytes, unless a single part needs more
 
+MOST_BUILDS: int = INVERSE.constant("MOST_BUILDS")
+
 PART, COLUMN = INVERSE.dtype("Part"), INVERSE.dtype("Column")
+BUILDS, STRIDES, INVERSE_STORAGE = (INVERSE.dtype(name) for name in ("Builds", "Strides", "InverseStorage"))
 
 
 @dataclass(frozen=True)

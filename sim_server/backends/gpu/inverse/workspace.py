@@ -22,7 +22,8 @@ class Workspace:
     incoming: device memory
     memory: device memory of the kernels
     generation: number of reallocations; graphs hold addresses of one generation
-    copied: event after which `staging` may be written again
+    copied: event after which `staging` may be written again, and the memory of `source` used again
+    source: the values that are being copied, kept until the next ones are
     lock: held while memory is made or a build is begun, which several threads do
     """
 
@@ -35,6 +36,7 @@ class Workspace:
         self._pinned: Any = None
         self.staging: NDArray[np.uint8] = np.zeros(0, np.uint8)
         self.copied: Event | None = None
+        self.source: NDArray[Any] | None = None
         self.lock = threading.Lock()
 
     def reserve(self, memory: int, incoming: int) -> None:

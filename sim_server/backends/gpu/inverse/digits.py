@@ -1,0 +1,46 @@
+# SPDX-License-Identifier: MIT
+"""How many binary digits the inverse of a factor needs: 11 (one float16 number an entry) or 22 (two).
+
+What is stored is S = D^-1 A^-1 D^-1 with D² the diagonal of A^-1 (plan.py). Rounded to S + E, entries of E about 2^-12
+of those of S, it makes of the preconditioned matrix I + A^1/2 D E D A^1/2, off from I by at most |E| |D A D|. The
+diagonal of D A D is A_ii (A^-1)_ii, the response: how much softer a degree of freedom is if all others give way than if
+they stay. It is 1 where nothing is coupled, 5 to 20 in usual bodies, and some hundred where parts of very different
+stiffness lie side by side, near Poisson's ratio 1/2 and in large time steps. There 11 digits cost iterations, and above
+a thousand they make a preconditioner that is not positive definite.
+"""
+
+import ctypes as c
+from functools import cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from protocol.factor import FactorPattern
+from sim_server.backends.compiler import native
+
+TEXT = "backends/gpu/inverse/digits.cpp"
+MOST_RESPONSE = 400.0
+"""Largest response of a degree of freedom (as estimated: up to twice the true one) that 11 digits are used for."""
+
+
+@cache
+def library() -> c.CDLL:
+    """Compiles and loads digits.cpp."""
+    signatures: dict[str, tuple[Any, list[Any]]] = {"largest_response": (c.c_double, [c.c_int64, *[c.c_void_p] * 5])}
+    return native(TEXT, signatures)
+
+
+def largest_response(pattern: FactorPattern, values: NDArray[np.floating]) -> float:
+    """Returns an estimate of the largest A_ii (A^-1)_ii of A = L L^T, the same for the same L; values (nonzeros,) of L.
+
+    Takes a few passes over L. From any thread, without Python's lock.
+    """
+    numbers = np.ascontiguousarray(values, np.float32)
+    arrays = pattern.super_start, pattern.row_start, pattern.rows, pattern.value_start, numbers
+    return float(library().largest_response(len(pattern.super_start) - 1, *(a.ctypes.data for a in arrays)))
+
+
+def planes_for(pattern: FactorPattern, values: NDArray[np.floating]) -> int:
+    """Returns the float16 numbers per entry that the inverse of this factor needs: 1, or 2 for 22 binary digits."""
+    return 1 if largest_response(pattern, values) <= MOST_RESPONSE else 2

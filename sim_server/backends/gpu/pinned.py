@@ -1,0 +1,22 @@
+# SPDX-License-Identifier: MIT
+"""Arrays in page-locked host memory, which the device reads by itself, beside other work."""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+class PinnedArray(np.ndarray):
+    """An array in page-locked memory. Its memory is used again once nothing refers to it."""
+
+
+def pinned_array(cp: Any, count: int, dtype: np.dtype[Any]) -> NDArray[Any]:
+    """Makes an array (count,) with any contents, in memory of CuPy's pool, whose pages have been touched before; one
+    that is not page-locked where the host has no such memory left."""
+    try:
+        memory = cp.cuda.alloc_pinned_memory(max(count * dtype.itemsize, 1))
+    except cp.cuda.runtime.CUDARuntimeError:
+        return np.empty(count, dtype)
+    array: NDArray[Any] = np.frombuffer(memory, dtype, count).view(PinnedArray)
+    return array

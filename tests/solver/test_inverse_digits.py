@@ -1,0 +1,90 @@
+# SPDX-License-Identifier: MIT
+"""How many binary digits the inverse of a factor gets on a GPU (gpu/inverse/digits.py)."""
+
+import numpy as np
+import pytest
+
+from precond_worker.factorization.factorize import Analysis
+from protocol.factor import FactorPattern
+from sim_server.backends.gpu.inverse.digits import MOST_RESPONSE, largest_response, planes_for
+from sim_server.backends.gpu.inverse.plan import plan
+from sim_server.simulation import Simulation
+from sim_server.updates.driver import Driver
+from tests.hard_cases.case import BAR, GRAVITY, young
+from tests.reference.partitioned import Application, stored
+from tests.reference.pcg import pcg
+from tests.scenes import factor_of
+from tests.worker.block_matrices import bar_edges, dense_matrix, pattern, spd
+
+SMALL = "object.bar.mesh={ bar = [2, 2, 8], size = [1, 1, 4] }"
+
+
+def exact(matrix: np.ndarray) -> float:
+    return float((np.diagonal(matrix) * np.diagonal(np.linalg.inv(matrix))).max())
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_the_estimate_is_near_the_largest_response(seed):
+    graph = pattern(60, bar_edges(2, 3, 4), np.arange(5))
+    values = spd(*graph, seed=seed)
+    analysis, true = Analysis(*graph), exact(dense_matrix(*graph, values))
+    for dtype in (np.float32, np.float64):
+        found = largest_response(analysis.pattern, analysis.factorize(values, dtype))
+        assert 0.6 * true < found < 2 * true
+
+
+def test_it_is_exact_where_nothing_is_coupled():
+    graph = pattern(7, np.empty((0, 2), int))
+    values = np.zeros((7, 3, 3))
+    values[:, range(3), range(3)] = np.geomspace(1e-8, 1e8, 21).reshape(7, 3)
+    analysis = Analysis(*graph)
+    assert largest_response(analysis.pattern, analysis.factorize(values)) == pytest.approx(1, rel=1e-6)
+
+
+def test_units_and_ratios_between_nodes_do_not_change_it():
+    """C A C with diagonal C: signs, and so what is estimated, stay those of A."""
+    pair = FactorPattern.build(np.arange(2), [0, 1, 2], [0, 2, 3], [0, 1, 1])
+    found = [largest_response(pair, np.array([a, 0.9 * b, b])) for a, b in ((1, 1), (1e3, 1), (1e-3, 1e6))]
+    assert found == pytest.approx([found[0]] * 3, rel=1e-5)
+    assert found[0] == pytest.approx(exact(np.array([[1, 0.9], [0.9, 1.81]])), rel=0.5)
+
+
+def test_the_same_factor_always_gets_the_same_and_one_with_nan_gets_22():
+    graph = pattern(60, bar_edges(2, 3, 4))
+    analysis, values = Analysis(*graph), spd(*graph, seed=3)
+    factor = analysis.factorize(values, np.float32)
+    assert largest_response(analysis.pattern, factor) == largest_response(analysis.pattern, factor.copy())
+    assert planes_for(analysis.pattern, factor) == 1
+    for k in (0, 100, len(factor) - 1):
+        spoiled = factor.copy()
+        spoiled[k] = np.nan
+        assert planes_for(analysis.pattern, spoiled) == 2
+
+
+CASES = {
+    "usual": ((), 1),
+    "stiff and soft side by side, 1e3": ((young(("X < 0.5", 1e7), ("true", 1e4)),), 1),
+    "stiff and soft side by side, 1e6": ((young(("X < 0.5", 1e10), ("true", 1e4)),), 2),
+    "from stiff to soft, 1e6": ((young(("Z < 1.3", 1e11), ("Z < 2.7", 1e8), ("true", 1e5)),), 1),
+    "Poisson 0.49": (("object.bar.effects.corotational.poisson=0.49",), 1),
+    "Poisson 0.4999": (("object.bar.effects.corotational.poisson=0.4999",), 2),
+    "a step of 2 s": (("dt=2.0",), 2),
+}
+
+
+@pytest.mark.parametrize(("scene", "planes"), CASES.values(), ids=CASES.keys())
+def test_factors_get_22_digits_where_11_take_several_times_the_iterations(scene, planes):
+    """Of the matrix of a step, by CG with the inverse rounded as a GPU stores it."""
+    sim = Simulation.load(BAR, [GRAVITY, SMALL, *scene])
+    Driver(sim).advance(10)
+    sim.engine.assemble()
+    (made, factor), b = factor_of(sim, dtype=np.float32), sim.system.b_material.ravel()
+    found = []
+    for digits in (1, 2):
+        p = plan(made, 16, planes=digits)
+        apply = Application(p, *stored(made, factor, p, np.float16))
+        found.append(len(pcg(sim.matrix(), b, apply, 1e-6, 100)) - 1)
+    response = largest_response(made, factor)
+    assert planes_for(made, factor) == planes and (response > MOST_RESPONSE) == (planes == 2)
+    coarse, fine = found
+    assert fine <= 3 and (coarse > 3 * fine if planes == 2 else coarse <= 5), (found, response)
