@@ -2,7 +2,10 @@
 """Checks of received data. Each raises Refused; sizes are checked before anything is allocated."""
 
 import math
-from collections.abc import Collection
+import os
+from collections.abc import Collection, Iterable
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
 from typing import Any, Protocol, TypeVar
 
 import numpy as np
@@ -17,6 +20,8 @@ from protocol.refused import Refused
 
 M = TypeVar("M", bound=Message)
 CHUNK = 1 << 18  # values checked together, so that temporaries stay in cache
+PIECE = 1 << 19  # values that a thread copies at a time
+ALONE = 8 << 20  # bytes that a thread copies alone
 
 
 class Sized(Protocol):
@@ -102,16 +107,35 @@ def all_finite(values: NDArray[Any]) -> bool:
 def copied(source: NDArray[Any], target: NDArray[Any], own: NDArray[Any]) -> tuple[int, bool]:
     """Copies values; returns their `checksum` and `all_finite`. They pass through memory once: pieces stay in cache.
 
+    On a machine with cores to spare other threads copy large arrays meanwhile, and this one sums up behind them.
+
     source, target: (n,), contiguous, of one type
     own: the one of the two that no other process writes to: what is returned is about its values
     """
-    digest, finite = xxhash.xxh3_64(), True
-    for begin in range(0, source.size, CHUNK):
-        piece = slice(begin, begin + CHUNK)
+
+    def copy(piece: slice) -> bool:
         np.copyto(target[piece], source[piece])
-        digest.update(own[piece].view(np.uint8).data)
-        finite = finite and bool(np.isfinite(own[piece]).all())
+        return bool(np.isfinite(own[piece]).all())
+
+    large = source.nbytes > ALONE
+    helpers, step = (helping_threads(), PIECE) if large else (0, CHUNK)
+    pieces = [slice(begin, begin + step) for begin in range(0, source.size, step)]
+    digest, finite = xxhash.xxh3_64(), True
+    with ExitStack() as closing:
+        if helpers:
+            pool = closing.enter_context(ThreadPoolExecutor(helpers, "copies"))
+            each: Iterable[bool] = pool.map(copy, pieces)
+        else:
+            each = map(copy, pieces)
+        for piece, good in zip(pieces, each, strict=True):
+            digest.update(own[piece].view(np.uint8).data)
+            finite = finite and good
     return int(digest.intdigest()), finite
+
+
+def helping_threads() -> int:
+    """Number of threads that copy a large array: a quarter of the cores, at most three."""
+    return min(3, len(os.sched_getaffinity(0)) // 4)
 
 
 def check_range(values: NDArray[Any], low: int, high: int, what: str) -> None:

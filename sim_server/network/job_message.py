@@ -8,7 +8,7 @@ from protocol.channels import PROTOCOL
 from protocol.messages_pb2 import Header, Matrix
 from protocol.method import Method
 from protocol.shared_memory.pool import Slot
-from protocol.validate import checksum
+from protocol.validate import checksum, copied
 from sim_server.arrays import Float64
 from sim_server.network.factor_decoder import AnnouncedObject
 from sim_server.network.leases import InFlightJob
@@ -59,8 +59,7 @@ def add_values(message: Matrix, values: Float64, slot: Slot | None) -> zenoh.ZBy
         data = values.tobytes()
         message.checksum = checksum(data)
         return zenoh.ZBytes(data)
-    copy = slot.array(np.float64, values.size)
-    np.copyto(copy.reshape(values.shape), values)
-    message.checksum = checksum(copy)
+    own = np.ascontiguousarray(values).reshape(-1)
+    message.checksum, _ = copied(own, slot.array(np.float64, values.size), own=own)
     message.matrix_slot.CopyFrom(slot.message())
     return slot.payload

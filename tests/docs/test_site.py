@@ -194,3 +194,13 @@ def test_the_site_is_built_without_a_warning(tmp_path: Path, capfd: pytest.Captu
 def test_ignored_files_are_no_pages() -> None:
     assert ROOT / "docs" / "scenes.md" in [ROOT / path for path in stage.pages()]
     assert all(path.suffix == ".md" for path in stage.pages())
+
+
+def test_every_page_is_in_a_table_of_contents() -> None:
+    """What Sphinx says of one that is not ends the build; it is not there where the default tests run."""
+    trees = re.findall(
+        r"```\{toctree\}(.*?)```", "".join(p.read_text() for p in (ROOT / "docs/site").glob("*.md")), re.S
+    )
+    listed = {Path(line.split("<")[-1].strip(" >")).name for tree in trees for line in tree.splitlines()}
+    pages = {path.stem for path in (ROOT / "docs").glob("*.md")}
+    assert len(pages) > 20 and pages - listed == set()

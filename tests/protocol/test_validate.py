@@ -6,6 +6,7 @@ import math
 import numpy as np
 import pytest
 
+from protocol import validate
 from protocol.channels import PROTOCOL
 from protocol.messages_pb2 import Command, Factor, Header, Interaction, Vector, WorkerInfo
 from protocol.refused import Refused
@@ -120,6 +121,21 @@ def test_one_pass_copies_and_tells_what_two_more_would(size: int, bad: float | N
     target = np.zeros_like(source)
     assert copied(source, target, own=target) == (checksum(source), all_finite(source))
     assert target.tobytes() == source.tobytes()
+
+
+@pytest.mark.parametrize("helpers", [0, 1, 3])
+@pytest.mark.parametrize("bad", [None, 0, -1])
+def test_threads_that_help_change_nothing(monkeypatch: pytest.MonkeyPatch, helpers: int, bad: int | None) -> None:
+    monkeypatch.setattr(validate, "PIECE", 1000)
+    monkeypatch.setattr(validate, "ALONE", 0)
+    monkeypatch.setattr(validate, "helping_threads", lambda: helpers)
+    source = np.random.default_rng(1).standard_normal(12_345).astype(np.float32)
+    if bad is not None:
+        source[bad] = np.inf
+    target = np.zeros_like(source)
+    for own in (source, target):
+        assert copied(source, target, own) == (checksum(source), bad is None)
+        assert target.tobytes() == source.tobytes()
 
 
 def test_what_is_told_is_about_the_own_values() -> None:

@@ -41,11 +41,27 @@ class PlannedInverse(NamedTuple):
     builder: InverseBuilder
 
 
-def threads_and_blocks(nodes: Int64, processors: int) -> tuple[int, int]:
-    """Returns threads per thread block and thread blocks per multiprocessor. nodes (bodies,): of each body."""
+BLOCK_BYTES, NODE_BYTES, OTHER_BYTES = (
+    76,
+    216,
+    5120,
+)  # in shared memory: of a block of A, a node, and the rest (spmv.cuh)
+
+
+def threads_and_blocks(nodes: Int64, blocks: Int64, processors: int, shared: int) -> tuple[int, int]:
+    """Returns threads per thread block and thread blocks per multiprocessor.
+
+    Of many small bodies four are on a multiprocessor, but two if that is what it takes to have their rows of A in its
+    shared memory, which else pass through it in every iteration.
+
+    nodes, blocks (bodies,): of each body and of its rows of A. shared: bytes of a multiprocessor.
+    """
     if len(nodes) <= processors - SPARED:
         return 256, 1  # 255 registers a thread: spilling to local memory costs a trip to L2
-    return (64, 4) if len(nodes) > 2 * processors and np.median(nodes) < 300 else (128, 2)
+    if len(nodes) <= 2 * processors or np.median(nodes) >= 300:
+        return 128, 2
+    needed = np.median(BLOCK_BYTES * blocks + NODE_BYTES * nodes) + OTHER_BYTES
+    return (128, 2) if shared / 4 < needed <= shared / 2 else (64, 4)
 
 
 class PcgSolver:
@@ -92,7 +108,9 @@ class PcgSolver:
             self._types["local"] = gpu.types["local"]
         spans = np.array(ranges, np.int64)
         nodes = spans[:, 1] - spans[:, 0]
-        self.threads, blocks = threads_and_blocks(nodes, processors)
+        rows = np.diff(arrays["row_start"].astype(np.int64)[spans], axis=1)[:, 0]
+        shared = gpu.properties["sharedMemPerMultiprocessor"]
+        self.threads, blocks = threads_and_blocks(nodes, rows, processors, shared)
         assigned, most = best_assignment(nodes, processors, blocks)
         self.grid = most if assigned.pooled else int(assigned.blocks.sum())
         self.spared = processors - -(-self.grid // blocks)

@@ -94,7 +94,7 @@ def in_real_time(tets: int, o: argparse.Namespace) -> dict[str, Any]:
     """Row of a server in real time with a worker on the same GPU."""
     from tests.bench.gpu.first_factor import measure as real_time
 
-    row = real_time(tets, seconds=2.0 if o.quick else 5.0, dt=REAL_DT)
+    row = real_time(tets, seconds=2.0 if o.quick else 4.0, dt=REAL_DT)
     print(row, flush=True)
     return row
 
