@@ -67,7 +67,8 @@ class NamedPoints:
     def box(self) -> tuple[Point, Point]:
         """Returns the lowest and highest coordinates [m]."""
         x = self._x[self._boxed]
-        return _point(x.min(axis=0)), _point(x.max(axis=0))
+        low, high = [c.min() for c in x.T], [c.max() for c in x.T]  # over rows at once takes many times as long
+        return _point(np.array(low)), _point(np.array(high))
 
     def where(self) -> str:
         """Returns the box in words."""

@@ -8,7 +8,7 @@ from protocol.messages_pb2 import Reply
 
 REST = 3  # times that a status took until the next one, so that a quarter of the time goes into them
 INTERVAL = 0.02  # s of that at most
-LATE = 0.02  # s for which a status waits for the places of objects, at most; then it is made without
+LATE = 0.01  # s for which a status waits for the places of objects, at most; then it is made without
 
 
 class StatusRequests:
