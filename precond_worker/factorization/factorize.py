@@ -2,13 +2,13 @@
 """Cholesky factors of one object: the symbolic phase once per topology, the numeric phase once per matrix."""
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
-from precond_worker.arrays import Float64, Int32
+from precond_worker.arrays import Float64, Int32, Together
 from precond_worker.errors import NotPositiveDefinite
 from precond_worker.symbolic.blocks import BLOCK, checked_pattern
 from protocol.factor import FactorPattern
@@ -33,10 +33,6 @@ class Library(Protocol):
     def modified_ldl(
         self, matrix: Float64, dtype: np.dtype[np.floating], growth: float
     ) -> tuple[NDArray[np.floating], int]: ...
-
-
-Together = Callable[[], NDArray[np.floating] | None]
-"""Waits for factors that are made together, (k, values); None if one of them has none."""
 
 
 @runtime_checkable

@@ -13,9 +13,9 @@ from functools import partial
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
-from precond_worker.arrays import Float64
+from precond_worker.arrays import Float64, Together
 from precond_worker.errors import NotPositiveDefinite, OutOfRange
-from precond_worker.factorization.factorize import Analysis, Together
+from precond_worker.factorization.factorize import Analysis
 from precond_worker.symbolic.blocks import BLOCK, checked_pattern, node_norms, pivot_threshold, rows_of
 from protocol.factor import FactorPattern
 

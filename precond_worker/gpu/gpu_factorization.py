@@ -6,9 +6,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from precond_worker.arrays import Float64, Int32
+from precond_worker.arrays import Float64, Int32, Together
 from precond_worker.errors import NotPositiveDefinite, OutOfRange
-from precond_worker.factorization.factorize import Together
 from precond_worker.gpu.assembly_tree import assembly_tree
 from precond_worker.gpu.copies import copies
 from precond_worker.gpu.device import best_precision, name, try_out
