@@ -30,7 +30,7 @@ class HostGpu:
 def applied(uploaded: DevicePlan, chunks: NDArray, scale: NDArray, r: NDArray) -> NDArray:
     """z of r, by phases and thread blocks: partitioned_inverse.cuh without its words."""
     p = uploaded.plan
-    a = {name: array.host for name, array in uploaded._arrays.items()}
+    a = {name: array.host for name, array in uploaded.arrays.items()}
     at = (a["place"][:, None] + np.arange(3)).ravel()
     residual = np.zeros(p.size + 32)
     residual[at] = scale[at] * r
@@ -96,7 +96,7 @@ def test_tiles_of_one_warp_each_and_of_several():
     s = system(GRAPHS["bar"])
     for blocks, warps in ((1, 2), (16, 8), (132, 8)):
         uploaded = DevicePlan(HostGpu, plan(s.pattern, blocks), warps)  # type: ignore[arg-type]
-        lists = uploaded._arrays["lists"].host
+        lists = uploaded.arrays["lists"].host
         phases = uploaded.plan.phases
         count, split = np.diff(lists[:, phases + 1 : 2 * phases + 2]), lists[:, 2 * phases + 2 : 3 * phases + 2]
         shared = split > 1

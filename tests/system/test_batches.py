@@ -20,6 +20,7 @@ from protocol.shared_memory.view import SlotMap
 from protocol.validate import checksum
 from sim_server.network import factor_intake, job_sender, worker_choice
 from sim_server.network.link import ServerLink
+from sim_server.network.send_queue import SendQueue
 from sim_server.updates.factor_source import Job
 from tests.ports import free_endpoint
 
@@ -344,7 +345,7 @@ def test_slots_are_not_lent_again_before_they_are_sent(stage: Hand, monkeypatch:
     """They are filled by the thread that sends them, even if nobody waits for the jobs any more."""
     dispatch, held = stage.driver.link.dispatch, list[Callable[[], None]]()
     stage.driver.until(lambda: dispatch.ready() >= len(NAMES) and not stage.driver.link.slots_lent, "room")
-    monkeypatch.setattr(dispatch._sender._queue, "post", lambda send: held.append(send) or True)
+    monkeypatch.setattr(SendQueue, "post", lambda queue, send, name=None: held.append(send) or True)
     assert dispatch.submit_many(jobs(950)) == [True] * len(NAMES)
     for job in dispatch.leases.jobs:
         dispatch.leases.cancel(job)

@@ -147,11 +147,11 @@ class DevicePlan:
             "segments": cut[segment_order], "index": entry_index(plan, cut[segment_order]), "tiles": tiles,
             "target": target, "place": plan.place,
         }  # fmt: skip
-        self._arrays = {name: gpu.cp.asarray(array.astype(np.int32, copy=False)) for name, array in arrays.items()}
+        self.arrays = {name: gpu.cp.asarray(array.astype(np.int32, copy=False)) for name, array in arrays.items()}
         params = np.zeros((), DEVICE_PLAN)
         params["phases"], params["blocks"], params["groups"] = plan.phases, plan.blocks, plan.groups
         params["size"], params["entries"] = plan.size, plan.x_area
-        for name, array in self._arrays.items():
+        for name, array in self.arrays.items():
             params[name] = array.data.ptr
         self._params = gpu.cp.asarray(params.reshape(1).view(np.uint8))
         self.address = int(self._params.data.ptr)
