@@ -379,6 +379,26 @@ def test_records_are_written_by_batches_where_there_is_room_and_else_by_steps():
     np.testing.assert_allclose(records["residual"], 1e-7 * (records["step"] - 1))
 
 
+def test_records_are_written_by_batches_again_once_they_are_fetched():
+    """In one run; a batch whose records had no place leaves one to those behind it."""
+    scene = FakeScene(records=2 * BATCH + 5)
+    graphs, launch, steps = [], scene.device.graph_launch, list[int]()
+
+    def reader(graph: int, stream: int) -> int:
+        graphs.append(graph)
+        if scene.loop.loop.records_dropped:
+            steps.extend(scene.loop.records()["step"])
+        return launch(graph, stream)
+
+    scene.device.set("graph_launch", reader)
+    scene.loop.run(20 * BATCH)
+    steps.extend(scene.loop.records()["step"])
+    assert steps == sorted(set(steps)) and len(steps) + scene.loop.loop.records_dropped == 20 * BATCH
+    assert 0 < scene.loop.loop.records_dropped <= 2 * BATCH
+    by_steps = sum(graph in RECORD_GRAPHS for graph in graphs) - scene.loop.loop.finished
+    assert by_steps <= 3 * BATCH
+
+
 @pytest.mark.parametrize("real", ["f4", "f8"])
 def test_matrices_are_those_of_the_step_after_the_request_in_all_bodies(real):
     scene = FakeScene(bodies=3, real=real)

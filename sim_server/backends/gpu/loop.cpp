@@ -287,6 +287,12 @@ static bool begin(GpuLoop& l) {
     return true;
 }
 
+// Batches that may be under way while the next one is launched. One whose records have no place leaves none to those behind it.
+static int64_t most_under_way(const GpuLoop& l) {
+    const bool placed = l.begun == l.finished || l.batches[(l.begun - 1) % STEP_BATCHES].place >= 0;
+    return l.rings.realtime || !placed ? 0 : STEP_BATCHES - 1;
+}
+
 extern "C" {
 
 // Runs until `steps` are done or `stop` is set; returns the steps done. l.error is set if the device failed.
@@ -295,7 +301,7 @@ int64_t wf_gpu_run(GpuLoop* loop, int64_t steps) {
     int64_t first = l.launched, left = steps;
     bool well = begin(l);
     while (well && left > 0) {
-        well = finish_down_to(l, l.rings.realtime ? 0 : STEP_BATCHES - 1);
+        well = finish_down_to(l, most_under_way(l));
         if (!well || !wait(l)) break;
         int64_t size = l.rings.pause.load() ? 1 : batch_size(l, left);  // single steps
         well = launch_batch(l, size);
