@@ -173,11 +173,9 @@ def failures(found: Found) -> list[Row]:
                     if row["wrong"]:
                         wrong.setdefault(row["wrong"], []).append(f"{_place(place)}, seed {row['seed']}")
             case = TABLES[kind][name]
-            elsewhere = texts.ON_A_GPU.get(name, "")
             for text, where in wrong.items():
-                there = elsewhere if all(each.startswith("GPU") for each in where) else ""
                 known = getattr(case, "fails", False) or getattr(case, "several", False)
-                why = there or getattr(case, "note", "") or "–"
+                why = getattr(case, "note", "") or "–"
                 row = {"case": f"**{name}**", "where": "; ".join(where), "what": text}
                 rows.append(row | {"known": "yes" if known else "no", "why": why})
     return rows

@@ -140,12 +140,3 @@ EXTREME_ROWS = [
         ),
     )
 ]
-
-ON_A_GPU = {  # why cases do not hold there
-    "struck by a tool": "In the second step the passes of contact run out. What the tool takes through the floor has "
-    "no place in front of both, and was set back in these runs in front of one, then of the other, a GPU once more "
-    "than a processor: in front of the tool, far below the floor. It takes the nearer place on both since "
-    "(`tests/gpu/test_contact_on_gpu.py`).",
-    "inside out: corotational, patch": "It came back a little later than had to be then.",
-    "inside out, symmetric mesh": "Rounding decides, and is another one there. These runs had to come back straight.",
-}
