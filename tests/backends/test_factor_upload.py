@@ -51,6 +51,7 @@ class Maker:
         self.thread = ThreadPoolExecutor(1)
         self.fine: set[int] = set()  # values whose inverses need 22 binary digits
         self.planes_used: list[int] = []
+        self.each_known: list[set[tuple[int, int]]] = []  # of all calls
         self.planning: list[Future] | None = None  # plans that are not made yet; None: it is made
         self.planned: Future = Future()
         self.planned.set_result(SimpleNamespace(builder=self, plan=None))
@@ -58,7 +59,7 @@ class Maker:
     def planes_for(self, pattern: SimpleNamespace, values: np.ndarray) -> int:
         return 2 if values[0] in self.fine else 1
 
-    def begin_plan(self, body: int, pattern: SimpleNamespace, planes: int) -> Future:
+    def begin_plan(self, body: int, pattern: SimpleNamespace, planes: int | None = None) -> Future:
         if self.planning is None and not isinstance(self.fail, ValueError):
             return self.planned
         made: Future = Future()
@@ -99,6 +100,7 @@ class Maker:
 
     def forget_plans(self, kept: set[tuple[int, int]]) -> None:
         self.known = kept
+        self.each_known.append(kept)
 
     def use(
         self, body: int, pattern: SimpleNamespace, inverse: PartitionedInverse, planes: int, step: int
@@ -332,6 +334,44 @@ def test_a_newer_factor_takes_the_place_of_a_prepared_one_and_its_check_is_told(
     assert waiting.result(0) is None
 
 
+def test_where_a_prepared_factor_cannot_be_applied_its_check_goes_without(parts, monkeypatch, caplog):
+    """The device writes into its storage by then, so that it is kept."""
+    scene, maker, upload = parts
+
+    def full(*arguments: Any) -> None:
+        raise NoMemory("full")
+
+    monkeypatch.setattr(maker, "apply", full)
+    with caplog.at_level(logging.WARNING):
+        values, applied = prepared(upload, 5)
+        assert applied.result(30) is None
+        maker.thread.submit(lambda: None).result()
+    assert [each.message for each in caplog.records] == ["object 'beam': a factor is not applied for its check: full"]
+    upload.post(0, PATTERN, values, 5)
+    upload.settle()
+    scene.loop.run(1)
+    assert used(scene) == [5] and len(maker.events) == len(maker.storages) == 1
+
+
+def test_a_build_that_fails_leaves_those_that_are_under_way(many, caplog):
+    """Of one plan, of which the builder takes a few at a time."""
+    maker, upload, boxes = many
+    build, asked = maker.build_many, count(1)
+
+    def full(*arguments: Any) -> list[PartitionedInverse]:
+        if next(asked) == 2:
+            raise NoMemory("full")
+        return build(*arguments)
+
+    maker.build_many = full
+    with caplog.at_level(logging.WARNING):
+        post_all(upload, list(range(1, len(boxes) + 1)))
+        maker.thread.submit(lambda: None).result()
+        upload.advance()
+    assert [box.posted for box in boxes] == [1, 2, 3, 0]
+    assert [each.message.split("'")[1] for each in caplog.records] == ["beam3"]
+
+
 def test_who_checks_is_told_that_nothing_can_be_built(parts, caplog):
     scene, maker, upload = parts
     maker.fail = NoMemory("none")
@@ -356,6 +396,28 @@ def test_plans_are_kept_of_the_last_two_patterns_alone(parts):
         upload.settle()
         scene.loop.run(1)
         assert maker.known == {(n, 1) for n in range(max(1, number - 1), number + 1)}
+
+
+def test_plans_of_factors_that_were_made_together_are_kept_until_all_are_posted(many):
+    """Else each but the first would be planned once more, and whoever posts would wait for it."""
+    maker, upload, boxes = many
+    kinds = [SimpleNamespace(id=number) for number in range(1, len(boxes) + 1)]
+    upload.post_many([(body, kind, np.array([kind.id]), 1) for body, kind in enumerate(kinds)])
+    maker.thread.submit(lambda: None).result()
+    upload.advance()
+    assert [box.posted for box in boxes] == [1] * len(boxes)
+    assert maker.each_known and all({(kind.id, 1) for kind in kinds} <= known for known in maker.each_known)
+
+
+def test_plans_of_factors_that_are_expected_are_kept(many):
+    """Such as those of large bodies, which a server makes as it starts; of each body those of one pattern."""
+    maker, upload, _ = many
+    for number in (7, 8, 9):
+        upload.expect(1, SimpleNamespace(id=number))
+    post(upload, 5)
+    assert maker.known == {(PATTERN.id, 1), (9, 1), (9, 2)}
+    upload.post(1, SimpleNamespace(id=10), np.array([6]), 1)
+    assert maker.known == {(PATTERN.id, 1), (10, 1)}, "it came with another one"
 
 
 def test_each_inverse_has_as_many_digits_as_its_factor_needs(parts, caplog):

@@ -26,7 +26,7 @@ class Planner:
     def beside(self, work: Callable[[], Any]) -> None:
         work()
 
-    def begin_plan(self, body: int, pattern: FactorPattern) -> None:
+    def expect(self, body: int, pattern: FactorPattern) -> None:
         self.planned.append((body, pattern.id))
 
 
@@ -42,7 +42,7 @@ def scene(first: int = 0) -> tuple[Planner, KnownPatterns]:
     start = np.arange(first + 2 * NODES + 10, dtype=np.int32)
     ranges = [(first, first + NODES), (first + NODES, first + 2 * NODES), (first + 2 * NODES, len(start) - 1)]
     planner = Planner()
-    return planner, KnownPatterns(planner, ranges, start, start[:-1])  # type: ignore[arg-type]
+    return planner, KnownPatterns(planner, planner.expect, ranges, start, start[:-1])  # type: ignore[arg-type]
 
 
 @pytest.fixture(autouse=True)
@@ -106,5 +106,6 @@ def test_files_used_longest_ago_go_when_there_are_too_many_bytes(folder, monkeyp
     os.utime(path, (1, 1))
     monkeypatch.setattr(known_patterns, "MOST_BYTES", path.stat().st_size)
     start = np.arange(NODES + 1, dtype=np.int32)
-    KnownPatterns(Planner(), [(0, NODES)], 2 * start, np.repeat(start[:-1], 2)).note(0, pattern())  # type: ignore[arg-type]
+    planner = Planner()
+    KnownPatterns(planner, planner.expect, [(0, NODES)], 2 * start, np.repeat(start[:-1], 2)).note(0, pattern())  # type: ignore[arg-type]
     assert not path.exists() and len(list(folder.iterdir())) == 1

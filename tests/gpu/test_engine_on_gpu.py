@@ -6,6 +6,8 @@ import gc
 import logging
 import threading
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 import numpy as np
 import pytest
@@ -48,6 +50,18 @@ def factor_of(sim: Simulation):
     return driver.inline.poll()[0]
 
 
+@contextmanager
+def running(sim: Simulation) -> Iterator[threading.Thread]:
+    """A run in a thread of its own, which is stopped at the end, however the test ends."""
+    thread = threading.Thread(target=sim.engine.run, args=(MOST,))
+    thread.start()
+    try:
+        yield thread
+    finally:
+        sim.engine.loop.stop = 1
+        thread.join()
+
+
 def test_steps_are_reported_with_their_own_times():
     sim = on_gpu()
     assert sim.engine.run(300) == 300
@@ -62,21 +76,20 @@ def test_steps_are_reported_with_their_own_times():
 def test_matrices_and_frames_that_come_home_beside_the_steps_are_of_their_step():
     sim, frames, matrices = on_gpu(), [], []
     sim.engine.loop.frame_every = 7
-    thread = threading.Thread(target=sim.engine.run, args=(MOST,))
-    thread.start()
     target = None
-    alive = True
-    while alive:
-        alive = thread.is_alive()
-        frames += sim.engine.frames()
-        if len(frames) >= 5 and len(matrices) >= 3:
-            sim.engine.loop.stop = 1
-        if target is None and alive:
-            target = np.zeros_like(sim.system.values)
-            sim.engine.request_matrix(0, target)
-        if target is not None and (step := sim.engine.matrix_step(0)) >= 0:
-            matrices.append((step, target))
-            target = None
+    with running(sim) as thread:
+        alive = True
+        while alive:
+            alive = thread.is_alive()
+            frames += sim.engine.frames()
+            if len(frames) >= 5 and len(matrices) >= 3:
+                sim.engine.loop.stop = 1
+            if target is None and alive:
+                target = np.zeros_like(sim.system.values)
+                sim.engine.request_matrix(0, target)
+            if target is not None and (step := sim.engine.matrix_step(0)) >= 0:
+                matrices.append((step, target))
+                target = None
     assert len(frames) >= 5
     assert len(matrices) >= 2
     again = on_gpu()
@@ -117,20 +130,19 @@ def test_settings_and_factors_are_taken_up_while_it_runs():
     factor = factor_of(sim)
     sim.engine.records()
     sim.engine.loop.patient = 1
-    sim.engine.solver.plan(0, factor.pattern)  # kernels that build inverses may be compiled for it
-    thread = threading.Thread(target=sim.engine.run, args=(MOST,))
-    thread.start()
-    while sim.engine.step < 32:
-        time.sleep(1e-3)
+    planes = sim.engine.solver.planes_for(factor.pattern, factor.values)
+    sim.engine.solver.plan(0, factor.pattern, planes)  # kernels that build inverses may be compiled for it
     records = []
-    sim.engine.settings(0).kind = 3
-    for step in (11, 12, 13):
-        sim.engine.post_factor(0, factor.pattern, factor.values, step)
-    while thread.is_alive():
-        records.append(sim.engine.records())
-        if len(records[-1]) and records[-1]["factor_step"][-1] == 13:
-            sim.engine.loop.stop = 1
-    thread.join()
+    with running(sim) as thread:
+        while thread.is_alive() and sim.engine.step < 32:
+            time.sleep(1e-3)
+        sim.engine.settings(0).kind = 3
+        for step in (11, 12, 13):
+            sim.engine.post_factor(0, factor.pattern, factor.values, step)
+        while thread.is_alive():
+            records.append(sim.engine.records())
+            if len(records[-1]) and records[-1]["factor_step"][-1] == 13:
+                sim.engine.loop.stop = 1
     records.append(sim.engine.records())
     r = np.concatenate(records)
     steps = r["factor_step"].tolist()

@@ -11,13 +11,14 @@ from tests.system.test_replay_of_a_server import STEPS, messages, recorded, repl
 pytestmark = pytest.mark.gpu
 
 
+@pytest.mark.timeout(600)  # where other tests keep the GPU busy, whose steps take turns
 @pytest.mark.parametrize("worker", ["cpu", "gpu"])
 @pytest.mark.parametrize("pace", ["--realtime", "--free-run"])
 def test_the_same_bit_for_bit(worker: str, pace: str, tmp_path: Path) -> None:
     """As fast as it goes many steps are launched together, and what comes in waits for the next batch."""
     steps = STEPS if pace == "--realtime" else 30_000
     options = ("--device", "gpu", "--worker-device", worker, pace, "--steps", str(steps))
-    log = recorded(tmp_path, "", "cholesky", *options)
+    log = recorded(tmp_path, "", "cholesky", *options, patience=240)
     touched = messages(log, "touch")
     assert len(touched) > 3 and touched[-1].step > touched[0].step, "the log says when the loop took them up"
     assert len({s.factor_step for s in messages(log, "step")}) > 10, "factors came from the worker all along"

@@ -58,11 +58,12 @@ def grab_often(client: Client) -> None:
 
 def recorded(
     folder: Path, solver: str = "", preconditioner: str = "cholesky", *options: str,
-    touch: Callable[[Client], None] = push_and_grab, effects: str = "",
+    touch: Callable[[Client], None] = push_and_grab, effects: str = "", patience: float = PATIENCE,
 ) -> Path:  # fmt: skip
     """A log of a beam that is touched while a worker makes its factors, which is there from one of the first steps on.
 
-    options: of the server [default: on the CPU]. effects: more lines of its table of effects
+    options: of the server [default: on the CPU]. effects: more lines of its table of effects. patience: s that it is
+    waited for at most
     """
     stage, log = Stage(folder), folder / "run.mcap"
     scene = beam(folder, solver=solver)
@@ -74,7 +75,7 @@ def recorded(
             until(lambda: preconditioner == "none" or fresh(client).workers, "the worker has joined")
             client.resume()
             touch(client)
-        assert server.wait() == 0, server.output()
+        assert server.wait(patience) == 0, server.output()
     finally:
         stage.close()
     return log

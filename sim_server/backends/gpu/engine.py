@@ -207,8 +207,9 @@ class GpuEngine(DeviceLoop):
         if measured is not None:
             self.report_measured(given.measured, measured)
         kept = () if most_blocks else ranges  # patterns of what is split change
-        self._patterns = KnownPatterns(self.solver, kept, arrays["row_start"], arrays["columns"])
-        self._factor_upload = FactorUpload(gpu, self.solver, self, given.names, self.mailboxes[bodies : 2 * bodies])
+        upload = FactorUpload(gpu, self.solver, self, given.names, self.mailboxes[bodies : 2 * bodies])
+        self._factor_upload = upload
+        self._patterns = KnownPatterns(self.solver, upload.expect, kept, arrays["row_start"], arrays["columns"])
         for k in range(bodies):
             whole = self.solver.bodies[k : k + 1].tobytes()
             self.mailboxes[k].post(whole[:SETTINGS_BYTES])

@@ -27,7 +27,7 @@ from sim_server.arrays import Float64
 from sim_server.backends.compiler import CompileError
 from sim_server.backends.gpu.device import Gpu, no_memory_left
 from sim_server.backends.gpu.inverse.apply_inverse import Applied
-from sim_server.backends.gpu.inverse.build_inverse import InverseStorage, PartitionedInverse
+from sim_server.backends.gpu.inverse.build_inverse import InverseBuilder, InverseStorage, PartitionedInverse
 from sim_server.backends.gpu.loop import DeviceLoop
 from sim_server.backends.gpu.mailbox import DeviceMailbox
 from sim_server.backends.gpu.solver import SETTINGS_BYTES, PcgSolver, PlannedInverse
@@ -128,6 +128,7 @@ class BodyUploads:
     building: in the thread of the plans, with others
     built: prepared, and the factor that it is of, which is neither posted nor dropped yet
     queued: a factor that waits for a storage, or for that thread
+    expected: id of the pattern that factors to come have; None once one of a new pattern came
     warned: True after the first factor that could not be used
     """
 
@@ -142,6 +143,7 @@ class BodyUploads:
     building: Builds | None = None
     built: tuple[UploadedFactor, GivenFactor] | None = None
     queued: GivenFactor | None = None
+    expected: int | None = None
     warned: bool = False
 
     @property
@@ -151,8 +153,9 @@ class BodyUploads:
 
     def kinds(self, body: int) -> set[InverseKind]:
         """Kinds of inverses whose plans are needed, or may be. body: number of this one"""
-        coming = [given for given in (self.queued, self.building and self.building.given[body]) if given]
-        return {*self.storages, *((given.pattern.id, planes) for given in coming for planes in (1, 2))}
+        given = [each for each in (self.queued, self.building and self.building.given[body]) if each]
+        coming = [each.pattern.id for each in given] + [each for each in (self.expected,) if each is not None]
+        return {*self.storages, *((pattern, planes) for pattern in coming for planes in (1, 2))}
 
 
 class FactorUpload:
@@ -175,7 +178,8 @@ class FactorUpload:
         self._known: set[InverseKind] = set()  # of which storages were made
 
     def expect(self, body: int, pattern: FactorPattern) -> None:
-        """Begins to plan the inverses of factors of a pattern, beside the caller."""
+        """Begins to plan the inverses of factors of a pattern, beside the caller. From any thread."""
+        self._uploads[body].expected = pattern.id
         self._solver.begin_plan(body, pattern)
 
     def post(self, body: int, pattern: FactorPattern, values: NDArray[Any], step: int) -> None:
@@ -400,8 +404,9 @@ class FactorUpload:
                 try:
                     self._build_by(plan.result(), chosen, places, made)
                 except Exception as error:
-                    for place in places:
-                        made[place] = error
+                    for place in places:  # of those that are there the device writes into the storage
+                        if not isinstance(made[place], UploadedFactor):
+                            made[place] = error
         finally:
             for each in chosen:
                 each.given.tell(None)
@@ -429,9 +434,19 @@ class FactorUpload:
             inverses = builder.build_many(values, [storages[place] for place in some], multiprocessors)
             for place, inverse in zip(some, inverses, strict=True):
                 given, planes = chosen[place].given, chosen[place].planes
-                if given.r is not None:
-                    given.tell(builder.apply(inverse, given.r, multiprocessors))
                 made[place] = UploadedFactor(inverse, storages[place], given.step, given.pattern, planes)
+            for place, inverse in zip(some, inverses, strict=True):
+                self._apply(builder, inverse, chosen[place])
+
+    def _apply(self, builder: InverseBuilder, inverse: PartitionedInverse, chosen: ChosenPlan) -> None:
+        """Begins to apply an inverse for the check of its factor, which goes without where that cannot be done: the
+        inverse is there all the same, and the device writes into its storage."""
+        if chosen.given.r is None:
+            return
+        try:
+            chosen.given.tell(builder.apply(inverse, chosen.given.r, self._multiprocessors))
+        except Exception as error:
+            log.warning("object %r: a factor is not applied for its check: %s", self._uploads[chosen.body].name, error)
 
     @property
     def _multiprocessors(self) -> int | None:
@@ -445,10 +460,12 @@ class FactorUpload:
     def _finish(self, builds: Builds) -> None:
         """Posts what was built beside the caller."""
         self._builds = [each for each in self._builds if each is not builds]
-        for body in builds.given:
-            self._uploads[body].building = None
+        if builds.made.exception() is not None:
+            for body in builds.given:
+                self._uploads[body].building = None
         errors = []
         for (body, given), made in zip(builds.given.items(), builds.made.result(), strict=True):
+            self._uploads[body].building = None  # not before: the plans of those behind it are needed
             try:
                 self._post(body, given, made)
             except Exception as error:  # the others are posted all the same
@@ -488,7 +505,9 @@ class FactorUpload:
             outdated = [k for k in uploads.storages if k != in_use]
             for old in outdated:
                 if len(uploads.storages) >= MAX_KINDS:
+                    factor.inverse.event.synchronize()  # a build before it, of one that was dropped, may write there
                     del uploads.storages[old]
+            uploads.expected = None
             if outdated or factor.kind not in self._known:
                 self._forget_plans(factor.kind)
         storages = uploads.storages.setdefault(factor.kind, [])

@@ -5,9 +5,10 @@ are planned while the server starts, and not when its first factor comes.
 What is read is checked as what a worker sends. A wrong file could cost the time of a plan that nobody uses.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import xxhash
@@ -30,15 +31,16 @@ SUFFIX = ".pattern"
 class KnownPatterns:
     """Patterns of the factors of the large bodies of a scene.
 
+    expect: begins to plan the inverses of factors with a pattern of a body (FactorUpload.expect)
     ranges: nodes [first, last) of each body
     row_start, columns: pattern of A
     """
 
     def __init__(
-        self, solver: PcgSolver, ranges: Sequence[tuple[int, int]], row_start: NDArray[np.int32],
-        columns: NDArray[np.int32],
+        self, solver: PcgSolver, expect: Callable[[int, FactorPattern], Any], ranges: Sequence[tuple[int, int]],
+        row_start: NDArray[np.int32], columns: NDArray[np.int32],
     ):  # fmt: skip
-        self._solver, self._row_start, self._columns = solver, row_start, columns
+        self._solver, self._expect, self._row_start, self._columns = solver, expect, row_start, columns
         self._ranges = {body: each for body, each in enumerate(ranges) if each[1] - each[0] >= LEAST_NODES}
         self._known: dict[int, int] = {}  # ids of patterns by body, the last one that was read or written
 
@@ -60,7 +62,7 @@ class KnownPatterns:
         except (DecodeError, Refused):
             return
         if found is not None and found.size == 3 * (last - first):
-            self._solver.begin_plan(body, found)
+            self._expect(body, found)
 
     def _keep(self, body: int, pattern: FactorPattern) -> None:
         path, data = self._path(body), pattern.message(Header()).SerializeToString()

@@ -192,8 +192,8 @@ class PcgSolver:
         with self._lock:
             gone = [key for key, made in self._plans.items() if key[:2] not in kept and made.done()]
             made = [self._plans.pop(key) for key in gone]
-        addresses = {each.result().plan.address for each in made if each.exception() is None}
-        self._vectors = {key: made for key, made in self._vectors.items() if key[1] not in addresses}
+            addresses = {each.result().plan.address for each in made if each.exception() is None}
+            self._vectors = {key: made for key, made in self._vectors.items() if key[1] not in addresses}
 
     def _compiled(self, name: str, blocks: int) -> KernelFunction:
         """Compiles the kernel of the text <name>.cu for `blocks` thread blocks a multiprocessor."""
@@ -322,9 +322,11 @@ class PcgSolver:
         return self.begin_plan(body, pattern, planes).result().plan
 
     def reserve_vectors(self, body: int, plan: DevicePlan) -> None:
-        """Allocates the vectors of solves of a body with factors of this plan, unless they are there."""
-        if (key := (body, plan.address)) not in self._vectors:
-            self._vectors[key] = plan.vectors()
+        """Allocates the vectors of solves of a body with factors of this plan, unless they are there. From any thread;
+        the caller has them complete before a step reads them."""
+        with self._lock:
+            if (key := (body, plan.address)) not in self._vectors:
+                self._vectors[key] = plan.vectors()
 
     def use(self, body: int, pattern: FactorPattern, inverse: PartitionedInverse, planes: int, step: int) -> None:
         """Writes a factor into the host row of a body; it is in use once the row is uploaded."""
