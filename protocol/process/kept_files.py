@@ -23,8 +23,9 @@ def kept_folder(name: str) -> Path:
 def read_kept(path: Path, most: int) -> bytes | None:
     """Returns what is in a file and marks it as used; None if there is none of at most so many bytes that can be
     trusted."""
+    flags = os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC | os.O_NONBLOCK  # a pipe would be waited for
     try:
-        with open(os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC), "rb") as file:
+        with open(os.open(path, flags), "rb") as file:
             info = os.fstat(file.fileno())
             others = stat.S_IWGRP | stat.S_IWOTH
             if not stat.S_ISREG(info.st_mode) or info.st_uid != os.geteuid() or info.st_mode & others:

@@ -12,7 +12,6 @@ import secrets
 from collections import deque
 from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -124,6 +123,7 @@ class SlotPool:
         self.limit = limit
         self._thread = ThreadPoolExecutor(1, "slots")
         self._making: dict[Future[Slot], int] = {}  # in that thread, with their capacities
+        self._unmade: set[int] = set()  # capacities that the thread could not make, until somebody was told
         self._free: dict[int, deque[Slot]] = {}  # by capacity, each the longest unused first
         self._lent: dict[int, int] = {}  # how many still use it, by id
         self._returns = 0
@@ -157,12 +157,16 @@ class SlotPool:
         """Lends a slot for `size` bytes, in a new generation; returns None if there is no memory for it.
 
         users: it is free again once it was given back so many times
-        beside: do not wait for a large one to be made: the first call begins to, and returns None
+        beside: do not wait for a large one to be made: the first call begins to, and returns None. If that fails, the
+            next call returns None without a further attempt, so that `is_making` tells
         """
         self._take_made()
         capacity = self._fitting(size)
         if capacity is None and beside and size > LARGE:
-            self.prepare(size)
+            if _rounded(size) in self._unmade:
+                self._unmade.discard(_rounded(size))
+            else:
+                self.prepare(size)
             return None
         slot = self._make(_rounded(size)) if capacity is None else self._free[capacity].pop()
         if slot is not None:
@@ -186,11 +190,15 @@ class SlotPool:
     def _take_made(self) -> None:
         """Adds the slots that the thread has made to those that are free."""
         for future in [each for each in self._making if each.done()]:
-            del self._making[future]
-            with suppress(SlotsUnusable):
+            capacity = self._making.pop(future)
+            try:
                 slot = future.result()
-                self._live.add(slot)
-                self._put_back(slot)
+            except (SlotsUnusable, OSError):
+                self._unmade.add(capacity)
+                continue
+            self._unmade.discard(capacity)
+            self._live.add(slot)
+            self._put_back(slot)
 
     def _fitting(self, size: int) -> int | None:
         """Returns the smallest capacity of a free slot that fits."""

@@ -167,18 +167,19 @@ class FactorDecoder:
         ):
             if value != wanted:
                 raise Refused(f"Factor.{name} is {value!r}; allowed: {wanted!r}, as in the matrix", "malformed")
-        pattern = self.objects[job.object].pattern(message.pattern)
+        known = self._known(job)
+        pattern = known.pattern(message.pattern)
         if pattern is None:
             raise Refused(f"Factor.pattern is {message.pattern:016x}, which was not sent before", "pattern")
         if message.nonzeros != pattern.nonzeros:
             raise Refused(f"Factor.nonzeros is {message.nonzeros}; allowed: {pattern.nonzeros}", "shape")
         if fetch is not None:
-            return self._factor(pattern, fetch(), None, job, message.seconds, message.remedy)
+            return self._factor(known, pattern, fetch(), None, job, message.seconds, message.remedy)
         if message.HasField("slot"):
             values, seen = self._from_slot(message.slot, message.nonzeros, job)
         else:
             values, seen = _from_payload(message, payload), None
-        return self._factor(pattern, values, message.checksum, job, message.seconds, message.remedy, seen)
+        return self._factor(known, pattern, values, message.checksum, job, message.seconds, message.remedy, seen)
 
     def parse_batch(self, key: object, attachment: Sized | None) -> FactorBatch:
         """Parses a message with answers to several jobs. Each answer is checked by itself, in `decode_one`."""
@@ -201,14 +202,15 @@ class FactorDecoder:
         seconds, nonzeros = message.seconds[place], message.nonzeros[place]
         if not 0 <= seconds < math.inf:
             raise Refused(f"FactorBatch.seconds has {seconds}; allowed: finite, 0 or more", "malformed")
-        pattern = self.objects[job.object].pattern(message.patterns[place])
+        known = self._known(job)
+        pattern = known.pattern(message.patterns[place])
         if pattern is None:
             raise Refused(f"FactorBatch.patterns has {message.patterns[place]:016x}, which was not sent", "pattern")
         if nonzeros != pattern.nonzeros:
             raise Refused(f"FactorBatch.nonzeros has {nonzeros}; allowed: {pattern.nonzeros}", "shape")
         values, seen = self._from_slot(message.slot, nonzeros, job)
         remedy = message.remedies[place] if message.remedies else ""
-        return self._factor(pattern, values, message.checksums[place], job, seconds, remedy, seen)
+        return self._factor(known, pattern, values, message.checksums[place], job, seconds, remedy, seen)
 
     def decode_several(
         self, message: FactorBatch, answers: Sequence[tuple[int, InFlightJob]]
@@ -223,16 +225,23 @@ class FactorDecoder:
         return made
 
     def _factor(
-        self, pattern: FactorPattern, values: Float32 | Float64, checksum: int | None, job: InFlightJob,
-        seconds: float, remedy: str, seen: tuple[int, bool] | None = None,
+        self, known: AnnouncedObject, pattern: FactorPattern, values: Float32 | Float64, checksum: int | None,
+        job: InFlightJob, seconds: float, remedy: str, seen: tuple[int, bool] | None = None,
     ) -> Factor:  # fmt: skip
         check_values(values, pattern, checksum, seen)
-        known = self.objects[job.object]
         known.largest[job.method] = max(known.largest.get(job.method, 0), pattern.nonzeros)
         self._unsized.discard(job.object)
         if job.method == COMPLETE and pattern.id not in known.complete.patterns:
             self._share(known.complete, pattern)
         return Factor(job.object, job.epoch, job.step, job.warp, pattern, values, job.worker, seconds, remedy[:200])
+
+    def _known(self, job: InFlightJob) -> AnnouncedObject:
+        """Returns what is known of the object of a job. From any thread: to be asked once for each answer, as another
+        epoch of the object may begin meanwhile."""
+        known = self.objects[job.object]
+        if known.epoch != job.epoch:
+            raise Refused(f"Factor.job is {job.number} of an epoch of {job.object} that is over", "epoch")
+        return known
 
     def _share(self, complete: CompleteFactors, pattern: FactorPattern) -> None:
         """Has all objects of a topology know the pattern of a complete factor of one of them."""

@@ -68,7 +68,9 @@ class JobSender:
         """Forgets when jobs were sent that are over, once they are many."""
         if len(self._sent) > MAX_SENT:
             flying = {job.number for job in self._book.leases.jobs}
-            self._sent = {number: when for number, when in self._sent.items() if number in flying}
+            for number in list(self._sent):  # a copy: the thread of the queue adds to it meanwhile
+                if number not in flying:
+                    del self._sent[number]
 
     def give_back_sent(self) -> None:
         """Gives back slots that the thread of the queue needs no more: they are free once their jobs are over, too."""

@@ -85,3 +85,26 @@ def test_sizes_are_known_once_each_topology_has_had_a_factor(decoder: FactorDeco
     assert decoder.most_are_sized
     decoder.announce(topology("b", OTHER, epoch=2))
     assert decoder.objects["b"].pattern(ANALYSIS.pattern.id) is None and not decoder.most_are_sized
+
+
+def test_a_factor_of_an_epoch_that_ends_while_it_is_taken_in_tells_nothing_of_the_next(decoder: FactorDecoder) -> None:
+    """Large ones are taken in by another thread, while the mesh of their object may be split."""
+    send_pattern(decoder, "a")
+    values = ANALYSIS.factorize(spd(*GRAPH), np.float32)
+    header = Header(protocol=PROTOCOL, incarnation=7, object="a", epoch=1)
+    message = FactorMessage(
+        header=header, step=3, warp=True, dtype="float32", pattern=ANALYSIS.pattern.id, nonzeros=len(values)
+    )
+    job = InFlightJob(1, "a", 1, 3, True, "float32", "w", 9.0)
+
+    def arriving() -> np.ndarray:
+        decoder.announce(topology("a", OTHER, epoch=2))
+        return values
+
+    decoder.decode(message, b"", job, arriving)
+    known = decoder.objects["a"]
+    assert known.epoch == 2 and known.known_patterns == [] and known.most_values("cholesky") == 0
+    assert decoder.objects["other"].known_patterns == [], "nor of another of the new topology"
+    send_pattern(decoder, "b")
+    with pytest.raises(Refused, match="of an epoch of a that is over"):
+        decoder.decode(message, b"", job, lambda: values)

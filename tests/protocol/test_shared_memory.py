@@ -92,6 +92,25 @@ def test_what_cannot_be_made_is_made_by_who_waits(pool: SlotPool, monkeypatch: p
     pool.prepare(7 << 20)
 
 
+def test_who_does_not_wait_is_told_that_none_can_be_made(pool: SlotPool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Once for each attempt: none is being made then, unlike while the attempt goes on."""
+    size, made = 6 << 20, []
+
+    def refused(capacity: int) -> Slot:
+        made.append(capacity)
+        raise SlotsUnusable("not now")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(module, "Slot", refused)
+        for attempt in (1, 2):
+            assert pool.lend(size, beside=True) is None and pool.is_making(size)
+            while pool.is_making(size):
+                pool.prepare(1)
+            assert pool.lend(size, beside=True) is None and not pool.is_making(size)
+            assert len(made) == attempt
+    assert pool.lend(size, beside=True) is None and pool.is_making(size), "and tried again"
+
+
 def test_a_slot_given_back_twice_is_lent_once(pool: SlotPool) -> None:
     slot = pool.lend(100_000)
     assert slot is not None

@@ -68,11 +68,16 @@ def linked(path):
     path.symlink_to(other)
 
 
+def piped(path):
+    path.unlink()
+    os.mkfifo(path, 0o600)
+
+
 @pytest.mark.parametrize(
     "spoil",
     [lambda p: p.write_bytes(p.read_bytes()[:-4]), lambda p: p.write_bytes(b""), twice, beyond, linked,
-     lambda p: p.chmod(0o620), lambda p: p.chmod(0o602)],
-    ids=["short", "empty", "not a permutation", "out of range", "a link", "group may write", "others may write"],
+     piped, lambda p: p.chmod(0o620), lambda p: p.chmod(0o602)],
+    ids=["short", "empty", "not a permutation", "out of range", "a link", "a pipe", "group may write", "others may"],
 )  # fmt: skip
 def test_what_cannot_be_trusted_is_made_anew(kept, spoil):
     order, path = kept

@@ -1,0 +1,106 @@
+# SPDX-License-Identifier: MIT
+"""When jobs were sent: noted by the thread that sends them, forgotten by the one that asks for it."""
+
+import logging
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+
+from protocol.channels import PROTOCOL
+from protocol.counters import Counters
+from protocol.messages_pb2 import Header, Topology
+from sim_server.network import job_sender
+from sim_server.network.bookkeeping import Bookkeeping
+from sim_server.network.factor_decoder import FactorDecoder
+from sim_server.network.job_sender import JobSender
+from sim_server.network.leases import Leases
+from sim_server.network.worker_registry import WorkerRegistry
+from sim_server.network.worker_reliability import WorkerReliability
+from sim_server.network.worker_timing import WorkerTiming
+from sim_server.updates.factor_source import Job
+
+
+class Number(int):
+    """The number of a job. Whoever looks up that of one that is over lets the thread of the queue send what waits."""
+
+    queue: "Queue"
+
+    def __hash__(self) -> int:
+        if int(self) in self.queue.over:
+            self.queue.send()
+        return int(self)
+
+
+class NumberedLeases(Leases):
+    def next_number(self) -> int:
+        return Number(super().next_number())
+
+
+class Queue:
+    """Sends once it is let."""
+
+    def __init__(self) -> None:
+        self.posted: list[Callable[[], None]] = []
+        self.over: set[int] = set()
+
+    def post(self, send: Callable[[], None], name: object = None) -> bool:
+        self.posted.append(send)
+        return True
+
+    def send(self) -> None:
+        while self.posted:
+            self.posted.pop()()
+
+
+class OneWorker:
+    """In place of network and choice: whatever is put is gone, and there is one worker, with room for all."""
+
+    def put(self, *args: Any, **options: Any) -> None:
+        return
+
+    def open(self) -> list[str]:
+        return ["w"]
+
+    def candidates(self, idle: list[str], object: str) -> list[str]:
+        return idle
+
+    def choose(self, idle: list[str], object: str) -> str:
+        return idle[0]
+
+
+def topology(name: str) -> Topology:
+    header = Header(protocol=PROTOCOL, incarnation=1, object=name, epoch=1)
+    row_start, columns = (np.array(each, np.int32).tobytes() for each in ([0, 1], [0]))
+    return Topology(header=header, nodes=1, row_start=row_start, columns=columns)
+
+
+def test_jobs_are_sent_while_the_times_of_others_are_forgotten(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(job_sender, "MAX_SENT", 1)
+    queue, one, names = Queue(), OneWorker(), [f"o{k}" for k in range(6)]
+    monkeypatch.setattr(Number, "queue", queue, raising=False)
+    leases, decoder = NumberedLeases(None), FactorDecoder(1)
+    book = Bookkeeping(WorkerRegistry(1, 1.0), leases, WorkerTiming(), WorkerReliability(), decoder, lambda: 7.0)
+    sender: Any = JobSender(one, "s", 1, None, queue, Counters(logging.getLogger(__name__)), book, one)  # type: ignore[arg-type]
+    for name in names:
+        book.announce(topology(name))
+
+    def submit(name: str) -> None:
+        assert sender.submit(Job(name, 1, 1, False, np.eye(3)[None]))
+
+    for name in names[:4]:
+        submit(name)
+    queue.send()
+    over, flying = leases.jobs[:3], leases.jobs[3]
+    for job in over:
+        leases.finish(job)
+    for name in names[4:]:
+        submit(name)
+    queue.over = {int(job.number) for job in over}
+    sender.forget_sent()
+    assert not queue.posted, "these were sent meanwhile"
+    queue.over = set()
+    assert [sender.sent_at(job) for job in over] == [float("inf")] * 3
+    assert len(leases.jobs) == 3 and flying in leases.jobs
+    assert [sender.sent_at(job) for job in leases.jobs] == [7.0] * 3
