@@ -557,6 +557,34 @@ def test_many_are_built_beside_the_caller(many):
     assert [box.posted for box in boxes] == [v + 10 for v in values] and len(maker.storages) == 2 * len(boxes)
 
 
+def test_of_several_of_one_body_among_many_the_last_one_is_used(many):
+    maker, upload, boxes = many
+    given = [*range(len(boxes)), 0]
+    upload.post_many([(body, PATTERN, np.array([step]), step) for step, body in enumerate(given, 1)])
+    maker.thread.submit(lambda: None).result()
+    upload.advance()
+    assert [box.posted for box in boxes] == [len(given), *range(2, len(given))]
+
+
+def test_what_is_dropped_while_it_is_built_is_not_applied(parts, monkeypatch):
+    _, maker, upload = parts
+    go, build, applications = threading.Event(), maker.build_many, []
+
+    def slow(*arguments: Any) -> list[PartitionedInverse]:
+        assert go.wait(30)
+        return build(*arguments)
+
+    monkeypatch.setattr(maker, "build_many", slow)
+    monkeypatch.setattr(maker, "apply", lambda *arguments: applications.append(arguments))
+    values, applied = prepared(upload, 5)
+    upload.drop(0, values)
+    assert applied.result(0) is None
+    go.set()
+    maker.thread.submit(lambda: None).result()
+    upload.advance()
+    assert len(maker.events) == 1 and applications == []
+
+
 def test_few_are_built_at_once(many):
     maker, upload, boxes = many
     post_all(upload, [1, 2])

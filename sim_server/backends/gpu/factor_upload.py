@@ -251,16 +251,16 @@ class FactorUpload:
         uploads.queued = given
 
     def post_many(self, given: Sequence[tuple[int, FactorPattern, NDArray[Any], int]]) -> None:
-        """Takes factors of different bodies, each as `post` takes one. Inverses of many are built beside the caller,
-        who would wait for one after another, those of one plan together."""
+        """Takes factors, each as `post` takes one; of several of a body the last one counts. Inverses of many are built
+        beside the caller, who would wait for one after another, those of one plan together."""
         with self._lock:
-            waiting = []
+            waiting: dict[int, None] = {}  # in this order
             for body, pattern, values, step in given:
                 self._refresh(body)
                 if not self._use_prepared(body, values):
                     self._enqueue(body, GivenFactor(pattern, values, step))
-                    waiting.append(body)
-            self._begin_queued(waiting)
+                    waiting[body] = None
+            self._begin_queued(list(waiting))
 
     def advance(self) -> None:
         """Posts what was built beside the caller, and begins the builds that have waited for a storage."""
@@ -441,7 +441,7 @@ class FactorUpload:
     def _apply(self, builder: InverseBuilder, inverse: PartitionedInverse, chosen: ChosenPlan) -> None:
         """Begins to apply an inverse for the check of its factor, which goes without where that cannot be done: the
         inverse is there all the same, and the device writes into its storage."""
-        if chosen.given.r is None:
+        if chosen.given.r is None or chosen.given.dropped:  # dropped: nobody would keep the memory that it comes to
             return
         try:
             chosen.given.tell(builder.apply(inverse, chosen.given.r, self._multiprocessors))
