@@ -10,7 +10,8 @@ from precond_worker.worker import Worker
 class RoundRobin:
     """Round robin over the servers with waiting jobs.
 
-    Each server sends a worker one job at a time, so that none waits for more than one job of each of the others.
+    Each server sends a worker one job at a time, or several of small objects, of which those that are factorized together
+    count as one: so none waits for more than one job of each of the others.
     wake: set by whatever is received, and by new servers.
     """
 
@@ -36,5 +37,9 @@ class RoundRobin:
             worker.take_in(0.0)
         for _ in range(len(self.workers)):
             self.workers.rotate(-1)
-            if self.workers[-1].work():
+            *others, worker = self.workers
+            if worker.waiting:
+                for other in others:
+                    other.finish()  # its factors are not to wait for this job
+                worker.work()
                 return

@@ -107,6 +107,17 @@ class Worker:
         self._done()
         return True
 
+    def finish(self) -> None:
+        """Waits for the jobs that are under way, and answers them."""
+        under_way, self._under_way = self._under_way, None
+        if under_way is None:
+            return
+        try:
+            self._end_together(under_way)
+        finally:
+            self._send_answers()
+        self._done()
+
     def _work(self) -> None:
         """Does jobs of one message for a while: their answers leave together. A job that came alone is done alone."""
         end = time.perf_counter() + ANSWER_SECONDS

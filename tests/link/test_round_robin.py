@@ -52,6 +52,7 @@ class Desk:
 
     def __init__(self, name: str, waiting: int, served: list[str]):
         self.name, self.waiting, self.served = name, waiting, served
+        self.finished: list[str] = []  # who had been served until then, each time
 
     def take_in(self, timeout: float) -> None:
         assert timeout == 0.0, "one server must not hold up the others"
@@ -62,6 +63,9 @@ class Desk:
         self.waiting -= 1
         self.served.append(self.name)
         return True
+
+    def finish(self) -> None:
+        self.finished.append("".join(self.served))
 
 
 def test_servers_with_jobs_are_served_in_turn() -> None:
@@ -88,3 +92,18 @@ def test_the_bell_ends_the_wait() -> None:
     threading.Timer(0.05, round_robin.wake.set).start()
     round_robin.step(60.0)  # the test's own limit ends it otherwise
     assert not round_robin.wake.is_set()
+
+
+def test_what_is_under_way_is_finished_before_the_job_of_another_server() -> None:
+    served: list[str] = []
+    round_robin = RoundRobin(threading.Event())
+    a, b = Desk("a", 3, served), Desk("b", 0, served)
+    for desk in (a, b):
+        round_robin.add(desk)  # type: ignore[arg-type]
+    round_robin.step(0.0)
+    round_robin.step(0.0)
+    assert a.finished == [], "nobody else waits: the next jobs are made ready meanwhile"
+    b.waiting = 1
+    round_robin.step(0.0)
+    round_robin.step(0.0)
+    assert "".join(served) in ("aaba", "aaab") and a.finished == ["".join(served).split("b")[0]]

@@ -235,6 +235,17 @@ def test_a_spoiled_matrix_does_not_spoil_those_of_others(together: Worker, conne
     assert "checksum" in failures["b"] and failures["a"] == failures["c"] == ""
 
 
+def test_what_is_under_way_is_answered_when_told_to_finish(together: Worker, connection: FakeConnection) -> None:
+    for k, name in enumerate("abc"):
+        connection.received.put(matrix(10 + k, name))
+    together.step(0.0)
+    assert together.waiting == 3 and connection.answers == []
+    together.finish()
+    assert [answer.job for answer, _ in connection.answers] == [10, 11, 12] and together.idle
+    together.finish()
+    assert len(connection.answers) == 3
+
+
 def test_what_is_under_way_for_a_server_that_is_gone_is_awaited(together: Worker, connection: FakeConnection) -> None:
     """A device writes to its memory until then. Nobody is answered."""
     for k, name in enumerate("abc"):
