@@ -240,7 +240,9 @@ class Worker:
     def _forget(self) -> None:
         self._counters.add("superseded", self.waiting)
         self._pending.clear()
-        self._under_way = None
+        under_way, self._under_way = self._under_way, None
+        if under_way is not None:
+            under_way.end()  # until then a device writes to memory that is freed with the analysis
         self._analyses.clear()
         self._assemblers.clear()
         self._connection.offered.clear()

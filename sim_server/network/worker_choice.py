@@ -3,12 +3,13 @@
 
 from collections.abc import Callable, Mapping
 
-from protocol.channels import MOST_JOBS
+from sim_server.network.batch_message import MOST_TOGETHER
 from sim_server.network.bookkeeping import Bookkeeping
 from sim_server.network.leases import MAX_EXPIRED, InFlightJob
 
 SMALL_BLOCKS = 20_000  # of the largest matrix, if several jobs may wait at a worker
 MOST_ALONE = 32  # jobs in flight at a worker while they go alone, each with slots of its own, which are slow to make
+MOST_BATCHES = 2  # full batches in flight at a worker: one is made, the next is made ready, more would only grow old
 QUEUE_SECONDS = 0.02  # s of factorizations that wait at a worker at most
 
 
@@ -42,7 +43,7 @@ class WorkerChoice:
         most = 1
         small = self._book.decoder.most_blocks <= SMALL_BLOCKS and self._shared
         if info is not None and info.shared_memory and seconds is not None and small:
-            most = MOST_JOBS if info.batches and self._book.decoder.most_are_sized else MOST_ALONE
+            most = MOST_BATCHES * MOST_TOGETHER if info.batches and self._book.decoder.most_are_sized else MOST_ALONE
             most = max(1, min(info.most_jobs, most, int(QUEUE_SECONDS / max(seconds, 1e-6))))
         return most
 

@@ -177,11 +177,13 @@ class Together(Diagonal):
 
     most = 3
     sizes: ClassVar[list[int]] = []
+    ended: ClassVar[list[int]] = []
 
     def begin_many(self, values: list[np.ndarray], dtype: Any) -> Callable[[], list[np.ndarray] | None]:
         self.sizes.append(len(values))
 
         def end() -> list[np.ndarray] | None:
+            self.ended.append(len(values))
             try:
                 return [self.factorize(each, dtype) for each in values]
             except ValueError:
@@ -195,7 +197,7 @@ def together(connection: FakeConnection) -> Worker:
     worker = Worker(connection, Together)  # type: ignore[arg-type]
     connection.received.put(ServersThere((7,)))
     worker.step(0.0)
-    Together.sizes = []
+    Together.sizes, Together.ended = [], []
     drain(worker, connection, *(matrix(k + 1, name) for k, name in enumerate("abcd")))  # analyses
     assert Together.sizes == []
     connection.answers.clear()
@@ -231,6 +233,18 @@ def test_a_spoiled_matrix_does_not_spoil_those_of_others(together: Worker, conne
     together.step(0.0)
     failures = {answer.header.object: answer.failure for answer, _ in connection.answers}
     assert "checksum" in failures["b"] and failures["a"] == failures["c"] == ""
+
+
+def test_what_is_under_way_for_a_server_that_is_gone_is_awaited(together: Worker, connection: FakeConnection) -> None:
+    """A device writes to its memory until then. Nobody is answered."""
+    for k, name in enumerate("abc"):
+        connection.received.put(matrix(10 + k, name))
+    together.step(0.0)
+    assert together.waiting == 3 and Together.ended == []
+    connection.received.put(ServerGone(7))
+    together.step(0.0)
+    assert Together.ended == [3] and together.idle
+    assert connection.answers == [] and connection.counters.superseded == 3
 
 
 def test_other_types_are_not_factorized_together(together: Worker, connection: FakeConnection) -> None:

@@ -13,12 +13,13 @@ from hand_worker import HandWorker
 from link_helpers import DenseAnalysis, Driver, chain, dense, light_worker, matrix, product
 from zenoh.handlers import RingChannel
 
-from protocol.channels import key
+from protocol.channels import MOST_JOBS, key
 from protocol.messages_pb2 import FactorBatch, MatrixBatch
 from protocol.shared_memory.limits import obstacle
 from protocol.shared_memory.view import SlotMap
 from protocol.validate import checksum
 from sim_server.network import factor_intake, job_sender, worker_choice
+from sim_server.network.batch_message import MOST_TOGETHER
 from sim_server.network.link import ServerLink
 from sim_server.network.send_queue import SendQueue
 from sim_server.updates.factor_source import Job
@@ -354,6 +355,18 @@ def test_slots_are_not_lent_again_before_they_are_sent(stage: Hand, monkeypatch:
     held[0]()
     stage.driver.until(lambda: not stage.driver.link.slots_lent, "the slots")
     assert stage.driver.until(stage.received.try_recv, "the batch") is not None
+
+
+def test_two_full_batches_are_in_flight_at_most(stage: Hand) -> None:
+    """However many a worker takes, and however fast it says that it is: the others would wait, and grow old."""
+    dispatch = stage.driver.link.dispatch
+    takes_more = lambda: [w for w in dispatch.workers() if w.most_jobs == MOST_JOBS]  # noqa: E731
+    stage.hello(most_jobs=MOST_JOBS)
+    stage.driver.until(takes_more, "the hello")
+    assert dispatch.ready() == 2 * MOST_TOGETHER < MOST_JOBS
+    stage.hello()
+    stage.driver.until(lambda: not takes_more(), "the hello")
+    assert dispatch.ready() == 64, "and no more than it takes"
 
 
 def test_a_worker_of_an_older_version_gets_them_one_by_one(stage: Hand) -> None:
