@@ -12,8 +12,8 @@ class PinnedArray(np.ndarray):
 
 
 def room_for(size: int) -> int:
-    """Returns bytes that an array of this size takes, up to an eighth more: the pool of CuPy uses memory again for exactly
-    as many, and gives none of it back. Factors of a body that is cut are all of nearly one size."""
+    """Returns bytes that an array of this size takes, up to an eighth more: the pool of CuPy uses memory again for
+    exactly as many, and gives none of it back. Factors of a body that is cut are all of nearly one size."""
     step = 1 << max(size.bit_length() - 4, 9)
     return max(-(-size // step), 1) * step
 
