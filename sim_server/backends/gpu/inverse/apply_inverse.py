@@ -85,7 +85,7 @@ class InverseApplication:
         """
         cp, n, plan = self._gpu.cp, self._plan.size, self._plan
         self._sent[self._place] = r
-        z = pinned_array(cp, n, np.dtype(np.float32))
+        z = self._received = pinned_array(cp, n, np.dtype(np.float32))  # kept: nobody may wait for the copy to it
         copy, kinds = cp.cuda.runtime.memcpyAsync, cp.cuda.runtime
         most = BLOCKS * multiprocessors
         with stream:
