@@ -10,8 +10,8 @@ from precond_worker.worker import Worker
 class RoundRobin:
     """Round robin over the servers with waiting jobs.
 
-    Each server sends a worker one job at a time, or several of small objects, of which those that are factorized together
-    count as one: so none waits for more than one job of each of the others.
+    Each server sends a worker one job at a time, or several of small objects, of which those that are factorized
+    together count as one: so none waits for more than one job of each of the others.
     wake: set by whatever is received, and by new servers.
     """
 
