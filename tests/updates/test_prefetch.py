@@ -150,6 +150,23 @@ def test_the_matrix_of_a_body_that_needs_no_factor_is_not_prefetched():
     assert sum(t.job.copy is not None for t in driver.bodies) <= 1
 
 
+def test_each_copy_of_a_body_alone_is_timed():
+    sim = falling(bar(name="beam", young=1e6, fixed="X < 0.01"), update="async")
+    source, timed = OneAtATime(patterns_of(sim)), []
+    driver = Driver(sim, source)
+    assert isinstance(driver.policy, Async)
+    driver.policy.prefetch.on_copy = timed.append
+    for sent in range(1, 4):
+        source.idle = 1
+        while len(source.order) < sent:
+            driver.policy.exchange()
+            driver.engine.run(1)
+            source.idle = 1
+            driver.policy.exchange()
+        assert len(timed) == len(source.order)
+    assert all(0 < seconds < 60 for seconds in timed)
+
+
 def test_counted_runs_do_not_prefetch():
     sim = falling(bar(name="beam", young=1e6, fixed="X < 0.01"), update="async")
     driver = Driver(sim, counted=True)
