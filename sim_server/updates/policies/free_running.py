@@ -38,7 +38,7 @@ class Async(UpdatePolicy):
         super().__init__(driver, n)
         self.prefetch = PrefetchDepth()
         self._exhausted = -1  # step at which no body was left to be asked for its matrix
-        self._newest_copy: BodyUpdateState | None = None  # that is there
+        self._newest_copy = -1  # that is there: number of its request
         self._choice_due = 0.0  # s; time before which `pump` chooses no bodies
 
     def step(self) -> None:
@@ -127,8 +127,8 @@ class Async(UpdatePolicy):
         """Sends copies to idle workers in the order of the requests. With a prefetch depth others wait their turn."""
         driver = self.driver
         copied = driver.snapshots.completed()
-        if copied and copied[-1] is not self._newest_copy:
-            self._newest_copy = copied[-1]
+        if copied and copied[-1].job.request > self._newest_copy:
+            self._newest_copy = copied[-1].job.request
             self.prefetch.on_copy(time.monotonic() - copied[-1].job.requested)
         idle = driver.source.ready() if copied else 0
         made: list[tuple[BodyUpdateState, Job]] = []
