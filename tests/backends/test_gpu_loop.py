@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from sim_server.backends import ring_buffers
 from sim_server.backends.cpu.structs import REACTION, REACTION_KINDS
 from sim_server.backends.gpu.loop import BATCH, CAPACITY, FRAMES
 from sim_server.backends.gpu.mailbox import ChangeMailbox
@@ -397,6 +398,24 @@ def test_records_are_written_by_batches_again_once_they_are_fetched():
     assert 0 < scene.loop.loop.records_dropped <= 2 * BATCH
     by_steps = sum(graph in RECORD_GRAPHS for graph in graphs) - scene.loop.loop.finished
     assert by_steps <= 3 * BATCH
+
+
+def test_a_reader_that_is_a_batch_late_slows_nothing_down():
+    """In the room that the ring has for many bodies: each batch finds its place, and none is written step by step."""
+    scene = FakeScene(bodies=3, records=3 * ring_buffers.STEPS)
+    graphs, launch, steps = [], scene.device.graph_launch, list[int]()
+
+    def reader(graph: int, stream: int) -> int:
+        graphs.append(graph)
+        if graph in RECORD_GRAPHS:
+            steps.extend(scene.loop.records()["step"][::3])
+        return launch(graph, stream)
+
+    scene.device.set("graph_launch", reader)
+    scene.loop.run(20 * BATCH)
+    steps.extend(scene.loop.records()["step"][::3])
+    assert steps == list(range(1, 20 * BATCH + 1)) and scene.loop.loop.records_dropped == 0
+    assert sum(graph in RECORD_GRAPHS for graph in graphs) == scene.loop.loop.finished
 
 
 @pytest.mark.parametrize("real", ["f4", "f8"])
