@@ -11,7 +11,8 @@ pytestmark = pytest.mark.system
 def test_a_short_soak_misses_no_step() -> None:
     found = soaked(0.1, QUICK, 0)
     whole = found["whole"]
-    assert whole["steps"] > 100 and whole["steps missed"] == 0 and whole["not converged"] == 0
+    assert whole["steps"] > 100 and whole["steps missed"] == 0
+    assert whole["not converged"] < 0.1 * whole["steps"], "some without a worker and with contact, at any moment"
     assert min(whole[name] for name in ("clients", "killed", "cut", "reset", "factors used")) > 0
     assert whole["refused"] == 0, "commands"
     assert {row["what"] for row in drifts(found["samples"])} >= {"resident MB", "descriptors", "threads"}
