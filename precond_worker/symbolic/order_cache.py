@@ -12,7 +12,8 @@ import numpy as np
 import xxhash
 
 from precond_worker.arrays import Int32, Int64
-from protocol.process.kept_files import keep, kept_folder, read_kept
+from protocol.process.cache_folder import cache_folder
+from protocol.process.kept_files import keep, read_kept
 
 MOST_BYTES = 256 << 20  # of all files together; the ones that were used longest ago are deleted
 LEAST_NODES = 2000  # of a graph that is kept: small ones are ordered faster than a file is written
@@ -28,7 +29,7 @@ def cached(order: Order, name: str, start: Int32, neighbours: Int32) -> Int64:
     digest = xxhash.xxh3_128(name.encode())
     for array in (start, neighbours):
         digest.update(len(array).to_bytes(8, "little") + np.ascontiguousarray(array).tobytes())
-    path = kept_folder("orders") / f"{digest.hexdigest()}{SUFFIX}"
+    path = cache_folder() / "orders" / f"{digest.hexdigest()}{SUFFIX}"
     found = _checked(read_kept(path, 4 * (len(start) - 1)), len(start) - 1)
     if found is None:
         found = order(start, neighbours)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Files that save time at the next start, in the folder of compiled kernels (WARPFACTOR_CACHE).
+"""Files that save time at the next start, in folders of cache_folder().
 
 Who reads one checks what is in it. A file of somebody else, or one that others may write to, counts as not there.
 """
@@ -11,13 +11,6 @@ import tempfile
 from pathlib import Path
 
 import numpy as np
-
-
-def kept_folder(name: str) -> Path:
-    """Returns the folder of the files of one kind."""
-    given = os.environ.get("WARPFACTOR_CACHE")
-    home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-    return (Path(given) if given else home / "warpfactor") / name
 
 
 def read_kept(path: Path, most: int) -> bytes | None:

@@ -19,6 +19,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+from protocol.process.cache_folder import cache_folder
 from sim_server.backends.build_pool import CompileError, Job, compilers
 from sim_server.backends.cache_trust import distrust
 from sim_server.backends.processor_variants import LIBRARIES, made_by, variant
@@ -68,13 +69,6 @@ def _machine() -> str:
     except (OSError, StopIteration):
         flags = platform.processor()
     return version + flags
-
-
-def cache_folder() -> Path:
-    """$WARPFACTOR_CACHE, else $XDG_CACHE_HOME/warpfactor, else ~/.cache/warpfactor."""
-    if folder := os.environ.get("WARPFACTOR_CACHE"):
-        return Path(folder)
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "warpfactor"
 
 
 def _make(folder: Path) -> None:

@@ -59,6 +59,7 @@ def make_libraries(folder: Path, variants: list[str]) -> None:
     """Compiles every text in each variant into a folder; what the cache of compiled kernels has is taken from it."""
     sys.path.insert(0, str(ROOT))  # a build backend has the folder of the project nowhere else
     try:
+        from protocol.process.cache_folder import cache_folder
         from sim_server.backends import compiler
         from sim_server.backends.build_pool import compilers
         from sim_server.backends.processor_variants import MADE_BY
@@ -67,7 +68,7 @@ def make_libraries(folder: Path, variants: list[str]) -> None:
     version = compiler.compiler_version()
     made: list[tuple[Path, Path]] = []
     for variant in variants:
-        cache = compiler.cache_folder() / "wheel" / variant
+        cache = cache_folder() / "wheel" / variant
         cache.mkdir(parents=True, exist_ok=True)
         (folder / variant).mkdir(parents=True)
         kernels = [(*compiler.source_of(path), ("real=double",)) for path in kernel_texts()]

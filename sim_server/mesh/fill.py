@@ -26,6 +26,7 @@ import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+from protocol.process.cache_folder import cache_folder
 from protocol.process.extras import to_install
 from sim_server.arrays import Float64, Int32, Int64
 from sim_server.errors import InputError
@@ -61,7 +62,7 @@ def filled(path: str | Path, edge: float, envelope: float | None = None, scale: 
             f"the diagonal of the surface, {diagonal:.4g} m"
         )
     given = [points.tobytes(), triangles.tobytes(), repr((FORM, edge, envelope)).encode()]
-    kept = cache_folder() / f"{path.stem}-{hashlib.sha256(b''.join(given)).hexdigest()[:24]}.npz"
+    kept = cache_folder() / "meshes" / f"{path.stem}-{hashlib.sha256(b''.join(given)).hexdigest()[:24]}.npz"
     begun, found = time.perf_counter(), _from_cache(kept)
     made = found is None
     rest, tets = tetrahedra_inside(path, points, triangles, edge, envelope / diagonal) if found is None else found
@@ -148,13 +149,6 @@ def _compared(points: Float64, triangles: Int64, volume: float) -> str:
     if loops or abs(off) > TOLD:
         return f"{what}, its tetrahedra {off:+.1%}" + (f": {why}" if abs(off) > TOLD else "")
     return ""
-
-
-def cache_folder() -> Path:
-    """Where meshes are kept: `meshes` in $WARPFACTOR_CACHE, else $XDG_CACHE_HOME/warpfactor or ~/.cache/warpfactor."""
-    if given := os.environ.get("WARPFACTOR_CACHE"):
-        return Path(given) / "meshes"
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "warpfactor" / "meshes"
 
 
 def _from_cache(path: Path) -> tuple[Float64, Int32] | None:

@@ -25,7 +25,7 @@ needs_pytetwild = pytest.mark.skipif(find_spec("pytetwild") is None, reason="pyt
 def cache(tmp_path, monkeypatch):
     """A cache of this test alone; compiled kernels stay where they are."""
     monkeypatch.setattr(fill, "cache_folder", lambda: tmp_path / "cache")
-    return tmp_path / "cache"
+    return tmp_path / "cache" / "meshes"
 
 
 @pytest.fixture

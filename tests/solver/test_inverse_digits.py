@@ -7,13 +7,9 @@ import pytest
 from precond_worker.factorization.factorize import Analysis
 from protocol.factor import FactorPattern
 from sim_server.backends.gpu.inverse.digits import MOST_RESPONSE, largest_response, planes_for
-from sim_server.backends.gpu.inverse.plan import plan
 from sim_server.simulation import Simulation
-from sim_server.updates.driver import Driver
 from tests.hard_cases.case import BAR, GRAVITY, young
-from tests.reference.partitioned import Application, stored
-from tests.reference.pcg import pcg
-from tests.scenes import factor_of
+from tests.support.digits import iterations_by_digits
 from tests.worker.block_matrices import bar_edges, dense_matrix, pattern, spd
 
 SMALL = "object.bar.mesh={ bar = [2, 2, 8], size = [1, 1, 4] }"
@@ -75,15 +71,7 @@ CASES = {
 @pytest.mark.parametrize(("scene", "planes"), CASES.values(), ids=CASES.keys())
 def test_factors_get_22_digits_where_11_take_several_times_the_iterations(scene, planes):
     """Of the matrix of a step, by CG with the inverse rounded as a GPU stores it."""
-    sim = Simulation.load(BAR, [GRAVITY, SMALL, *scene])
-    Driver(sim).advance(10)
-    sim.engine.assemble()
-    (made, factor), b = factor_of(sim, dtype=np.float32), sim.system.b_material.ravel()
-    found = []
-    for digits in (1, 2):
-        p = plan(made, 16, planes=digits)
-        apply = Application(p, *stored(made, factor, p, np.float16))
-        found.append(len(pcg(sim.matrix(), b, apply, 1e-6, 100)) - 1)
+    found, made, factor = iterations_by_digits(Simulation.load(BAR, [GRAVITY, SMALL, *scene]), 10, 100)
     response = largest_response(made, factor)
     assert planes_for(made, factor) == planes and (response > MOST_RESPONSE) == (planes == 2)
     coarse, fine = found

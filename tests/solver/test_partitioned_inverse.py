@@ -16,12 +16,11 @@ from sim_server.backends.gpu.inverse.expansion_batches import workspace_layout
 from sim_server.backends.gpu.inverse.partition import tree_of
 from sim_server.backends.gpu.inverse.plan import FORM, GATHER, READ, WRITE, Plan, lay_out, plan
 from sim_server.simulation import Simulation
-from sim_server.updates.driver import Driver
 from tests.hard_cases.case import BAR, GRAVITY
 from tests.reference.partitioned import Application, by_tasks, stored
-from tests.reference.pcg import pcg
 from tests.reference.supernodal import columns
 from tests.scenes import bar, factor_of, simulation
+from tests.support.digits import iterations_by_digits
 from tests.worker.block_matrices import bar_edges, dense_matrix, pattern, spd
 
 GRAPHS = {
@@ -107,14 +106,7 @@ def test_what_11_binary_digits_do_not_bear_22_do(law):
     """Solves of a step by CG with the factor of its own matrix, stored as a GPU does."""
     mesh = "object.bar.mesh={ bar = [2, 2, 8], size = [1, 1, 4] }"
     sim = Simulation.load(BAR, [GRAVITY, mesh, f"object.bar.effects.corotational.{law}"])
-    Driver(sim).advance(20)
-    sim.engine.assemble()
-    (pattern_, factor), b = factor_of(sim, dtype=np.float32), sim.system.b_material.ravel()
-    iterations = []
-    for planes in (1, 2):
-        p = plan(pattern_, 16, planes=planes)
-        apply = Application(p, *stored(pattern_, factor, p, np.float16))
-        iterations.append(len(pcg(sim.matrix(), b, apply, 1e-6, 200)) - 1)
+    iterations, _, _ = iterations_by_digits(sim, 20, 200)
     assert iterations[1] <= 3 and iterations[0] > 3 * iterations[1], iterations
 
 

@@ -9,7 +9,7 @@ from functools import cache
 from importlib import metadata
 from pathlib import Path
 
-from sim_server.backends.compiler import cache_folder
+from protocol.process.cache_folder import cache_folder
 
 ROOT = Path(__file__).resolve().parents[2]
 HEADERS = ("sim_server", "precond_worker", "tests/backends")  # where a text may include from

@@ -19,7 +19,8 @@ from protocol.channels import CHANNELS
 from protocol.factor import FactorPattern
 from protocol.messages_pb2 import FactorPattern as PatternMessage
 from protocol.messages_pb2 import Header
-from protocol.process.kept_files import keep, kept_folder, read_kept
+from protocol.process.cache_folder import cache_folder
+from protocol.process.kept_files import keep, read_kept
 from protocol.refused import Refused
 from sim_server.backends.gpu.solver import PcgSolver
 
@@ -74,4 +75,4 @@ class KnownPatterns:
         start = self._row_start[first : last + 1].astype(np.int64)
         digest = xxhash.xxh3_128((start - start[0]).tobytes())
         digest.update((self._columns[start[0] : start[-1]].astype(np.int64) - first).tobytes())
-        return kept_folder("patterns") / f"{digest.hexdigest()}{SUFFIX}"
+        return cache_folder() / "patterns" / f"{digest.hexdigest()}{SUFFIX}"

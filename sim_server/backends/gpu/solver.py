@@ -41,11 +41,8 @@ class PlannedInverse(NamedTuple):
     builder: InverseBuilder
 
 
-BLOCK_BYTES, NODE_BYTES, OTHER_BYTES = (
-    76,
-    216,
-    5120,
-)  # in shared memory: of a block of A, a node, and the rest (spmv.cuh)
+# Bytes in shared memory of a block of A, of a node, and of the rest (spmv.cuh).
+BLOCK_BYTES, NODE_BYTES, OTHER_BYTES = 76, 216, 5120
 
 
 def threads_and_blocks(nodes: Int64, blocks: Int64, processors: int, shared: int) -> tuple[int, int]:
