@@ -22,14 +22,13 @@ from precond_worker.remote_assembly import Assemblers
 from protocol.channels import WHOLE_PARTS
 from protocol.factor import FactorPattern
 from protocol.messages_pb2 import Factor
-from protocol.method import Method
+from protocol.method import COMPLETE, Method
 from protocol.process.exhausted import exhausted
 from protocol.refused import Refused
 from protocol.validate import array, checksum, copied, topology_checksum
 
 log = logging.getLogger(__name__)
 
-COMPLETE = Method().name
 ANSWER_SECONDS = 3e-3  # s for which answers wait for others of their batch
 
 Analyse = Callable[[Int32, Int32, Method], Factorization]  # registry.make_factorization

@@ -6,9 +6,10 @@ from dataclasses import dataclass
 
 from protocol.refused import Refused
 
-__all__ = ["METHODS", "Method"]
+__all__ = ["COMPLETE", "METHODS", "Method"]
 
-METHODS = ("cholesky", "incomplete_cholesky", "ssor")
+COMPLETE = "cholesky"  # the method whose factors have a pattern that the matrix alone decides
+METHODS = (COMPLETE, "incomplete_cholesky", "ssor")
 
 
 @dataclass(frozen=True)
@@ -20,7 +21,7 @@ class Method:
     ssor: the symmetric successive over-relaxation of the matrix with relaxation omega.
     """
 
-    name: str = "cholesky"
+    name: str = COMPLETE
     drop_tolerance: float = 0.0
     fill: float = 0.0
     omega: float = 1.0

@@ -14,7 +14,7 @@ from protocol.messages_pb2 import Factor as FactorMessage
 from protocol.messages_pb2 import FactorBatch, Topology
 from protocol.messages_pb2 import FactorPattern as PatternMessage
 from protocol.messages_pb2 import Slot as SlotMessage
-from protocol.method import Method
+from protocol.method import COMPLETE
 from protocol.refused import Refused
 from protocol.validate import (
     Sized,
@@ -31,7 +31,6 @@ from sim_server.arrays import Float32, Float64
 from sim_server.network.leases import InFlightJob
 from sim_server.updates.factor_source import FactorMemory
 
-COMPLETE = Method().name
 LARGE = 1 << 20  # bytes of a factor for which `memory` is asked
 MAX_PATTERNS = 4  # kept per object: one for each library among its workers
 
