@@ -78,6 +78,11 @@ struct PartitionedInverse {
         near = plan->entries;
         kept = arena.take<uint4>(32 * near);
     }
+    struct Stream {};
+    void open(Stream&) const {}
+    double multiply(int phase, const ResidualSource& from, unsigned number, float unit, Stream&) const {
+        return multiply(phase, from, number, unit);
+    }
     void fetch() const {
         for (int k = threadIdx.x; k < 128 * near; k += THREADS) ((int*)kept)[k] = 7;
     }
@@ -113,6 +118,7 @@ static float __uint_as_float(unsigned a) { float b; std::memcpy(&b, &a, 4); retu
 static unsigned atomicAdd(unsigned* a, int by) { return __atomic_fetch_add(a, by, __ATOMIC_SEQ_CST); }
 static void __trap() { std::abort(); }
 static int max(int a, int b) { return a < b ? b : a; }
+static unsigned max(unsigned a, unsigned b) { return a < b ? b : a; }
 """
 CLOCK = """
 #pragma once
@@ -147,7 +153,7 @@ def compiled(folder: Path, text: str, *defined: str) -> c.CDLL:
     headers = {"block_group.cuh": group, "pcg.cu": solver, "partitioned_inverse.cuh": INVERSE, "clock.cuh": CLOCK}
     for name, written in headers.items():
         (folder / name).write_text(written)
-    for name in ("spmv.cuh", "correction.cuh", "contact.cu"):  # beside the other headers
+    for name in ("spmv.cuh", "correction.cuh", "pool_order.cuh", "contact.cu"):  # beside the other headers
         (folder / name).write_text((gpu / name).read_text())
     header, found = re.subn(r"CONTACT_THREADS = \d+", f"CONTACT_THREADS = {THREADS}",
                             (gpu / "device_contact.cuh").read_text())  # fmt: skip
@@ -177,13 +183,16 @@ class Solver:
     near: pieces of 512 bytes of an inverse that are in shared memory
     blocks: thread blocks of the body
     host: stands for the GPU
+    alone: compiled with -DALONE
     phases: NewtonPhases.of_solves, where a step has several linearizations
     """
 
     def __init__(
         self, sim: Simulation, monkeypatch: pytest.MonkeyPatch, near: int = 0, blocks: int = 1,
-        host: SolverHost | None = None, phases: Sequence[Any] = (),
+        host: SolverHost | None = None, phases: Sequence[Any] = (), alone: bool = False,
     ):  # fmt: skip
+        monkeypatch.setattr(gpu_solver, "alone", lambda *a: alone)
+        monkeypatch.setattr(gpu_solver, "threads_and_blocks", lambda *a: (THREADS, 1))
         monkeypatch.setattr(gpu_solver, "compiled", lambda name, module, kernel: SimpleNamespace())
         assigned = lambda nodes, processors, most: (assign_blocks(nodes, blocks), blocks)  # noqa: E731
         monkeypatch.setattr(gpu_solver, "best_assignment", assigned)

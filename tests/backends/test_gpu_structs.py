@@ -84,7 +84,7 @@ def test_the_compiler_for_gpus_refuses_another_layout(tmp_path):
 @pytest.mark.parametrize(
     ("threads", "blocks", "more"),
     [(256, 1, []), (128, 2, []), (64, 4, []), (64, 4, ["-DNEWTON_PHASES"]), (256, 1, ["-DSTAGES"]),
-     (256, 1, ["-DCONTACT_PASSES"]), (64, 4, ["-DCONTACT_PASSES"])],
+     (256, 1, ["-DCONTACT_PASSES"]), (64, 4, ["-DCONTACT_PASSES"]), (256, 1, ["-DALONE"]), (64, 4, ["-DALONE"])],
 )  # fmt: skip
 def test_the_solver_spills_no_registers(threads, blocks, more):
     """What does not fit into registers would cost a trip through L2 in each phase: it did, and doubled the time."""
@@ -94,7 +94,8 @@ def test_the_solver_spills_no_registers(threads, blocks, more):
     options += [f"-DTHREADS={threads}", f"-DPER_PROCESSOR={blocks}", "-arch=sm_90", *more]
     code, said = nvrtc.compiled(library, SOURCES / "backends/gpu/pcg.cu", options)
     spilled = [int(n) for n in re.findall(r"(\d+) bytes (?:stack frame|spill stores|spill loads)", said)]
-    assert code and spilled and max(spilled) <= 32, said
+    most = 64 if "-DALONE" in more else 32  # of what lives through an iteration
+    assert code and spilled and max(spilled) <= most, said
 
 
 def test_thread_blocks_take_all_registers():
@@ -124,6 +125,18 @@ def test_thread_blocks_take_all_registers():
     assert {key for key, pair in found.items() if pair == (64, 4)} == {
         (265, 160), (1000, 299), (265, 50), (265, 120),
     }  # fmt: skip
+
+
+def test_bodies_that_exchange_nothing_have_a_multiprocessor_each():
+    """Many of them; of few, as many as there are more than multiprocessors would be a round of their own."""
+
+    def shape(bodies, nodes, exchanges):
+        given = np.full(bodies, nodes), np.full(bodies, 10 * nodes), 132, 233472
+        return threads_and_blocks(*given, exchanges=exchanges)
+
+    assert shape(512, 176, False) == shape(256, 756, False) == (256, 1)
+    assert shape(512, 176, True) == (64, 4) and shape(256, 756, True) == (128, 2)
+    assert shape(140, 756, False) == (128, 2) and shape(512, 16, False) == (64, 4)
 
 
 @pytest.mark.slow

@@ -70,3 +70,19 @@ def test_the_same_bits_whoever_solves_them(tmp_path):
         Driver(sim).advance(6)
         ends.append(sim.fetch().x.copy())
     assert np.array_equal(*ends)
+
+
+def test_each_as_one_alone(tmp_path):
+    """Bodies with a multiprocessor for each, whose matrix passes through it: equal ones to the bit, as on the CPU."""
+    count, bar = 200, (5, 5, 20)
+    text = OBJECT.format(k="{k}", bar=list(bar), length=bar[2] / 2, x="{x}", angle=0, young=1e5)
+    ends = []
+    for device, bodies in (("gpu", count), ("cpu", 1)):
+        path = tmp_path / f"{device}.toml"
+        path.write_text(HEAD + "".join(text.replace("{k}", str(k)).replace("{x}", "0") for k in range(bodies)))
+        sim = Simulation.load(path, [], device)
+        assert (Driver(sim).advance(6)["status"] == SolveStatus.CONVERGED).all()
+        ends.append(sim.fetch().x.reshape(bodies, -1, 3).copy())
+    gpu, cpu = ends
+    assert (gpu == gpu[0]).all()
+    assert np.abs(gpu[0] - cpu[0]).max() < 1e-5

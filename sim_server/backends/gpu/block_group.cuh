@@ -46,6 +46,16 @@ __device__ __forceinline__ void copies_begin() { asm volatile("cp.async.commit_g
 template <int LEFT>
 __device__ __forceinline__ void copies_end() { asm volatile("cp.async.wait_group %0;" ::"n"(LEFT) : "memory"); }
 
+#ifdef ALONE
+// Each body has one thread block, whose barriers order what its threads exchange: a word is the value alone.
+template <class T> struct FlagWord {
+    T value;
+    __device__ __forceinline__ void put(T v, unsigned) { value = v; }
+    __device__ __forceinline__ FlagWord<T> load() const { return *this; }
+    __device__ __forceinline__ bool unpack(T& v, unsigned) const { v = value; return true; }
+    __device__ __forceinline__ bool get(T& v, unsigned) const { v = value; return true; }
+};
+#else
 // Thread blocks exchange values as words of 8 bytes: half a value (or half of a double), half the number of the exchange. A reader
 // polls the word itself until it has the number. This needs no barrier and no fence, and one trip through L2 instead of four. A
 // word is written and read atomically; no ordering between words is needed.
@@ -85,6 +95,7 @@ template <> struct __align__(16) FlagWord<double> {
     }
     __device__ __forceinline__ bool get(double& v, unsigned number) const { return load().unpack(v, number); }
 };
+#endif
 
 // True if the word must be read again. After some minutes the launch fails instead of hanging the device, and the server reports
 // that the device is lost.
@@ -104,6 +115,14 @@ struct BlockGroup {
     FlagWord<double>* peak_words;  // (2, grid) of this body; null, as `peaks`, where no largest values are asked for
     double* peaks;                 // shared, WARPS + 1
 
+    __device__ __forceinline__ bool several() const {
+#ifdef ALONE
+        return false;
+#else
+        return blocks > 1;
+#endif
+    }
+
     // Adds N <= 4 values over lanes 0 to LANES - 1 of all warps of the group; every thread gets the sums. Also a barrier.
     // fenced: writes to memory before it are visible to all after it.
     // PEAK: `peak`, of each thread, becomes the largest of the group; none is below 0.
@@ -120,12 +139,12 @@ struct BlockGroup {
             if (lane % 4 < N)
                 for (int k = lane / 4; k < LANES * WARPS; k += 8) sum += scratch[k][lane % 4];
             for (int k = 16; k >= 4; k >>= 1) sum += __shfl_xor_sync(ALL, sum, k);
-            if (blocks == 1 && lane < N) totals[lane] = sum;
+            if (!several() && lane < N) totals[lane] = sum;
             if (fenced) __threadfence();
-            if (blocks > 1 && lane < N) row[lane * grid + index].put(sum, number);
+            if (several() && lane < N) row[lane * grid + index].put(sum, number);
             if constexpr (PEAK) put_peak();
         }
-        if (blocks > 1)
+        if (several())
             for (int n = warp; n < N; n += WARPS) {
                 const double sum = read(row + n * grid);
                 if (fenced) __threadfence();
@@ -183,11 +202,11 @@ struct BlockGroup {
     // By the first warp.
     __device__ __forceinline__ void put_peak() const {
         const double most = most_of_warp(lane < WARPS ? peaks[lane] : 0);
-        if (lane == 0 && blocks == 1) peaks[WARPS] = most;
-        if (lane == 0 && blocks > 1) peak_words[(number & 1) * grid + index].put(most, number);
+        if (lane == 0 && !several()) peaks[WARPS] = most;
+        if (lane == 0 && several()) peak_words[(number & 1) * grid + index].put(most, number);
     }
     __device__ __forceinline__ void read_peak(int reader) const {
-        if (blocks == 1 || warp != reader) return;
+        if (!several() || warp != reader) return;
         const double most = read<true>(peak_words + (number & 1) * grid);
         if (lane == 0) peaks[WARPS] = most;
     }

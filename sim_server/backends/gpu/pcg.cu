@@ -16,6 +16,9 @@
 #endif
 #include "partitioned_inverse.cuh"
 #include "clock.cuh"
+#ifdef ALONE
+#include "pool_order.cuh"
+#endif
 #include "spmv.cuh"
 #ifdef STAGES
 #include "stages.cuh"
@@ -28,6 +31,12 @@
 #endif
 #ifdef BUDGETS
 #include "step_budget.cuh"
+#endif
+
+#ifdef ALONE
+#define HELD &
+#else
+#define HELD
 #endif
 
 struct BlockMemory {  // static shared memory of a thread block: data that is the same in all threads needs no registers
@@ -120,10 +129,19 @@ struct PcgSolver {
             if (inverted) memory.peak = inverse.scale[inverse.size];
         }
         packed = body.kind == CHOLESKY && body.plan;
+#ifdef ALONE
+        __syncthreads();
+        const bool early = packed && !memory.rests;  // beside the first residual, which may be all that a body at rest needs
+        if (early) fetch();
+        find_places();  // while A is on its way
+        if (early) copies_end<1>();
+        else copies_end<0>();
+#else
         copies_end<0>();
         __syncthreads();
         if (packed && group.blocks > 1) fetch();  // beside the first residual; many bodies of the pool need only that
         find_places();
+#endif
         __syncthreads();
     }
 
@@ -136,7 +154,7 @@ struct PcgSolver {
     __device__ __forceinline__ void find_places() {
         const BlockRows& rows = memory.rows;
         for (int k = threadIdx.x; k < rows.halo; k += THREADS) {
-            int node = rows.nodes[k];
+            int node = rows.node(k);
             rows.place[k] = packed ? memory.plan.place[node] : 3 * (memory.body.first + node);
 #ifdef CUTS
             if (packed && s.at_rest[memory.body.first + node] != 0) rows.place[k] |= APART;
@@ -185,7 +203,11 @@ struct PcgSolver {
         const long long first = memory.body.first, begin = 3 * (first + rows.begin);
 #pragma unroll 4
         for (int k = threadIdx.x; k < 3 * rows.halo; k += THREADS)
-            rows.values[k] = __ldcg(s.y + 3 * (first + rows.nodes[k / 3]) + k % 3);
+            rows.values[k] = __ldcg(s.y + 3 * (first + rows.node(k / 3)) + k % 3);
+#ifdef ALONE
+#pragma unroll 4
+        for (int k = threadIdx.x; k < 3 * rows.own; k += THREADS) rows.r[k] = s.b[begin + k];
+#endif
         __syncthreads();
 #ifdef ERRORS
         const double moved2 = largest2([&](int k) { return rows.values[k] - rows.before[k]; });
@@ -198,7 +220,11 @@ struct PcgSolver {
 #endif
         rows.multiply([&](int node, int c, real qk) {
             const int k = 3 * node + c;
+#ifdef ALONE
+            const real bk = rows.r[k];
+#else
             const real bk = s.b[begin + k];
+#endif
             const double rk = (double)bk - (double)qk;
             mine[0] += rk * rk;
             mine[1] += (double)bk * (double)bk;
@@ -232,14 +258,21 @@ struct PcgSolver {
         return out[0];
     }
 
-    // Sums of the lanes that BlockRows.finish used into lanes 0 to 2.
+    // Sums of the lanes that had entries of a product into lanes 0 to 2.
     template <int N>
     static __device__ __forceinline__ void into_three(double mine[N]) {
+#ifdef ALONE
+        for (int n = 0; n < N; ++n) {
+            for (int k = 16; k; k >>= 1) mine[n] += __shfl_xor_sync(ALL, mine[n], k);
+            if (threadIdx.x % 32) mine[n] = 0;
+        }
+#else
         static_assert(SLAB_ROWS <= 4 && TOGETHER <= 4, "lanes 0 to 11 have sums");
         for (int n = 0; n < N; ++n) {
             mine[n] += __shfl_down_sync(ALL, mine[n], 6);
             mine[n] += __shfl_down_sync(ALL, mine[n], 3);
         }
+#endif
     }
 
 #ifdef ERRORS
@@ -357,7 +390,7 @@ struct PcgSolver {
 #else
     __device__ __forceinline__ void direction(real beta, double out[4]) {
 #endif
-        const BlockRows rows = memory.rows;
+        const BlockRows HELD rows = memory.rows;
         if (packed) rows.form(memory.inverse.z, z_number, beta, [&](int k, float z) { return applied(rows, k, z); });
         else rows.form(s.z, z_number, beta, [](int, real z) { return z; });
 #ifdef ERRORS
@@ -387,7 +420,7 @@ struct PcgSolver {
 
     // 3. 4. 5. 6. x += alpha p, r -= alpha q, z = P^-1 r; returns z . r. r2: |r|^2 after the update.
     __device__ __forceinline__ double precondition(int kind, real alpha, double r2) {
-        const BlockRows rows = memory.rows;
+        const BlockRows HELD rows = memory.rows;
         for (int k = threadIdx.x; k < 3 * rows.own; k += THREADS) {
 #ifdef CORRECTED
             if (column >= 0) {
@@ -442,7 +475,7 @@ struct PcgSolver {
 #endif
 
     __device__ __forceinline__ double by_diagonal(int kind) const {
-        const BlockRows rows = memory.rows;
+        const BlockRows HELD rows = memory.rows;
         double mine = 0;
         for (int k = threadIdx.x; k < 3 * rows.own; k += THREADS) {
             const real *r = rows.r + k / 3 * 3, *v = memory.diagonal + 3 * k;
@@ -465,13 +498,25 @@ struct PcgSolver {
 #else
         fresh = false;
 #endif
+#if defined(ALONE) && defined(CORRECTED)
+        __syncthreads();  // a column is published just before
+#endif
         if (!fetched) fetch();
         if (!arrived) copies_end<0>();
+#ifdef ALONE
+        if (!arrived) __syncthreads();  // for what other threads have copied
+        PartitionedInverse::Stream stream;
+        inverse.open(stream);
+#endif
         arrived = true;
         for (int phase = 0; phase < inverse.phases; ++phase) {
             inverse.gather(phase, from, group.number, unit);
             __syncthreads();
+#ifdef ALONE
+            mine += inverse.multiply(phase, from, group.number, unit, stream);
+#else
             mine += inverse.multiply(phase, from, group.number, unit);
+#endif
             from = {residuals(1 - turn), group.number, 0, 0};
             if (phase + 1 < inverse.phases) __syncthreads();  // the vector has been read
         }
@@ -490,7 +535,7 @@ struct PcgSolver {
 
     // What the correction takes off z, by entry of the halo.
     __device__ __forceinline__ float correction_at(const BlockRows& rows, int k) const {
-        return taken_off(memory.correction, correction_row(rows.nodes[k / 3]) + k % 3 * given_correction.width);
+        return taken_off(memory.correction, correction_row(rows.node(k / 3)) + k % 3 * given_correction.width);
     }
 
     // Compares the own nodes' blocks with those that the factor knows, and without contact keeps what springs add to this matrix. Returns
@@ -524,7 +569,7 @@ struct PcgSolver {
             const int pair = c.pair && step - then < HISTORY ? c.pair[node] : -1;
             if (spring != 0 || pair >= 0) {
                 int at = rows.row_start[k] - rows.base;
-                while (rows.columns[at] != k) ++at;
+                while ((rows.columns[at] & COLUMN) != k) ++at;
                 double difference[6];
                 share = difference_of(c, pair, spring, rows.blocks + 9ll * at, then, memory.body.planes, difference);
                 if (share > 0)
@@ -560,6 +605,9 @@ struct PcgSolver {
     // Keeps the own rows of a column of V.
     __device__ __forceinline__ void keep_column() const {
         const BlockRows& rows = memory.rows;
+#ifdef ALONE
+        __syncthreads();
+#endif
         for (int k = threadIdx.x; k < 3 * rows.own; k += THREADS) {
             const FlagWord<float>* z = memory.inverse.z + rows.position(k / 3) + k % 3;
             float value;
@@ -625,7 +673,7 @@ struct PcgSolver {
         const BlockRows& rows = memory.rows;
         for (int node = threadIdx.x; node < rows.own; node += THREADS) {
             int k = rows.row_start[node] - rows.base;
-            while (rows.columns[k] != node) ++k;
+            while ((rows.columns[k] & COLUMN) != node) ++k;
             invert3(rows.blocks + 9ll * k, whole, memory.diagonal + 9 * node);
         }
     }
@@ -1021,8 +1069,14 @@ extern "C" __global__ void __launch_bounds__(THREADS, PER_PROCESSOR) pcg(const P
         if (next < 0) {  // take the next body of the pool
             if (threadIdx.x == 0) memory.next = s.pooled > 0 ? atomicAdd(s.pool_counter, 1) : s.pooled;
             __syncthreads();
+#ifdef ALONE
+            if (memory.next == s.pooled && s.pooled > 0) sort_pool(s);
+            if (memory.next >= s.pooled) return;
+            next = s.bodies[pool_order(s, s.step[0])[memory.next]].first_range;
+#else
             if (memory.next >= s.pooled) return;
             next = s.bodies[s.order[s.count - s.pooled + memory.next]].first_range;
+#endif
         }
 #ifdef NEWTON_PHASES
         const bool solved = phase[s.row_ranges[next].body] != 0;

@@ -36,12 +36,15 @@ struct DevicePlan {
     const int* target;                // position of each contribution in PcgBody.contributed
     const int* place;                 // (nodes,) packed position of a node
     int entries;                      // of the longest vector of a phase
+    int contributions;                // words of PcgBody.contributed
 };
 
 template <class T> struct FlagWord;  // block_group.cuh
 
 // Rows of A of one thread block, and the nodes that they read (row_partition.ROW_RANGE).
-struct RowRange { int body, index, begin, own, halo_first, halo, block_first, blocks; };
+// -DALONE: upper: blocks of A on and above the diagonal; window: most of them that a slab and those on their way need (spmv.cuh),
+// 0 if they are more than that allows.
+struct RowRange { int body, index, begin, own, halo_first, halo, block_first, blocks, upper, window; };
 
 struct PcgBody {
     int first, nodes;              // range of the nodes of the scene
@@ -79,12 +82,15 @@ struct PcgArguments {
     const real* values;            // (blocks, 3, 3)
     const real* b;                 // (nodes, 3)
     real* y;                       // (nodes, 3) in: initial guess; out: solution
-    const int* order;              // bodies: those with thread blocks of their own, then the pool, largest first
+    const int* order;              // (2, bodies) those with thread blocks of their own, then the pool (pool_order.cuh); in even and
+                                   // in odd steps
     int pooled, grid;              // number of bodies in the pool, which free thread blocks take one by one; number of thread blocks
     const RowRange* row_ranges;    // of all thread blocks of all bodies
     const int* initial_range;      // (grid,) range with which each thread block begins, -1: the pool
     const int* halo;               // lists of nodes that a thread block reads, its own first
-    const int* local_column;       // (blocks of A,) column as an index into that list
+    const int* local_column;       // (blocks of A,) column as an index into that list; -DALONE: see spmv.cuh
+    const int* upper_start;        // -DALONE: (nodes + bodies,) blocks on and above the diagonal before each row of its body
+    const int* lowest_row;         // -DALONE: (nodes,) first row of the body whose blocks this row and the later ones need
     real* halo_values;             // (halo, 3) used if they do not fit into shared memory
     int* halo_position;            // (halo,) likewise
     real* own_vectors;             // (3, nodes, 3) x, r, q likewise; -DERRORS: (4, nodes, 3), x at the last look, too

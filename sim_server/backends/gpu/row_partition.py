@@ -146,6 +146,46 @@ def lists_of(partition: Halo) -> dict[str, NDArray[np.int32]]:
     return {"row_ranges": ranges, "halo": nodes.astype(np.int32), "local_column": local.astype(np.int32)}
 
 
+AHEAD, COLUMN_BITS = 1, 15  # of spmv.cuh
+WARP_ROWS = 8  # rows of a slab for each warp
+ROW_BLOCKS = 17  # most blocks of A in a slab for each of its rows
+
+
+def mirrored(partition: Halo, row_start: Int32, columns: Int32, warps: int) -> dict[str, NDArray[np.int32]]:
+    """Returns the arrays by which one thread block a body finds each block of A among those on and above the diagonal,
+    and sets what shared memory that takes in `partition`.
+
+    warps: of a thread block
+    """
+    total, ranges = int(row_start.shape[0]) - 1, partition.ranges
+    starts, columns = row_start.astype(np.int64), columns.astype(np.int64)
+    rows = np.repeat(np.arange(total), np.diff(starts))
+    above = columns >= rows
+    rank: Int64 = np.cumsum(above) - above  # among the kept blocks of all bodies
+    of_row = np.append(rank, int(above.sum()))[starts]  # of the first block of each row
+    other = np.searchsorted(rows * total + columns, np.where(above, rows * total + columns, columns * total + rows))
+    first = partition.ranges["block_first"]
+    body = np.repeat(np.arange(len(ranges)), ranges["blocks"])
+    rank = rank[other] - rank[first][body]
+    word = (rank << COLUMN_BITS + 1) | (np.where(above, 0, 1) << COLUMN_BITS) | partition.local
+    lowest, uppers, slab = np.empty(total, np.int64), [], WARP_ROWS * warps
+    for k, (own, at) in enumerate(zip(ranges["own"].tolist(), first.tolist(), strict=True)):
+        low = int(rows[at])
+        upper = of_row[low : low + own + 1] - of_row[low]
+        reached = np.minimum.accumulate(columns[starts[low : low + own]][::-1])[::-1] - low
+        lowest[low : low + own] = reached
+        opens = np.arange(0, own, slab)
+        ends = upper[np.minimum(opens + (AHEAD + 1) * slab, own)]
+        fits = np.diff(np.append(starts[low + opens], starts[low + own])).max() <= ROW_BLOCKS * slab
+        ranges["upper"][k] = upper[-1]
+        ranges["window"][k] = (ends - upper[reached[opens]]).max() if fits else 0
+        uppers.append(upper)
+    return {
+        "row_ranges": ranges.view(np.int32), "local_column": word.astype(np.uint32).view(np.int32),
+        "upper_start": np.concatenate(uppers).astype(np.int32), "lowest_row": lowest.astype(np.int32),
+    }  # fmt: skip
+
+
 def initial_ranges(assigned: BlockAssignment, partition: Halo, grid: int) -> Int32:
     """Returns the range with which each thread block of the grid begins, -1 where it takes one of the pool."""
     found = np.full(grid, -1, np.int32)

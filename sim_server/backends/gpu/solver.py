@@ -23,7 +23,15 @@ from sim_server.backends.gpu.inverse.device_plan import DevicePlan, shared_bytes
 from sim_server.backends.gpu.inverse.digits import library as digits_library
 from sim_server.backends.gpu.inverse.digits import planes_for
 from sim_server.backends.gpu.inverse.plan import plan
-from sim_server.backends.gpu.row_partition import SPARED, best_assignment, halo, initial_ranges, lists_of
+from sim_server.backends.gpu.row_partition import (
+    COLUMN_BITS,
+    SPARED,
+    best_assignment,
+    halo,
+    initial_ranges,
+    lists_of,
+    mirrored,
+)
 from sim_server.backends.gpu.structs import CONTACT, CORRECTION, PCG, PCG_RESULT, STAGES
 
 T = TypeVar("T")
@@ -43,22 +51,38 @@ class PlannedInverse(NamedTuple):
 
 # Bytes in shared memory of a block of A, of a node, and of the rest (spmv.cuh).
 BLOCK_BYTES, NODE_BYTES, OTHER_BYTES = 76, 216, 5120
+FILLING = 100  # nodes of a body that keep a multiprocessor busy
 
 
-def threads_and_blocks(nodes: Int64, blocks: Int64, processors: int, shared: int) -> tuple[int, int]:
+def threads_and_blocks(
+    nodes: Int64, blocks: Int64, processors: int, shared: int, exchanges: bool = True
+) -> tuple[int, int]:
     """Returns threads per thread block and thread blocks per multiprocessor.
 
-    Of many small bodies four are on a multiprocessor, but two if that is what it takes to have their rows of A in its
-    shared memory, which else pass through it in every iteration.
+    Bodies of many small ones have a multiprocessor for themselves, one after another, since its shared memory then
+    holds half of A and much of the factor. Tiny ones do not fill one: four are on a multiprocessor, or two if that is
+    what it takes to have their rows of A in its shared memory, which else pass through it in every iteration.
 
-    nodes, blocks (bodies,): of each body and of its rows of A. shared: bytes of a multiprocessor.
+    nodes, blocks (bodies,): of each body and of its rows of A. shared: bytes of a multiprocessor. exchanges: True if a
+    body may not be solved as one that exchanges nothing (block_group.cuh), which keeps half of A
     """
     if len(nodes) <= processors - SPARED:
         return 256, 1  # 255 registers a thread: spilling to local memory costs a trip to L2
+    if not exchanges and len(nodes) > 1.5 * processors and np.median(nodes) >= FILLING:
+        return 256, 1
     if len(nodes) <= 2 * processors or np.median(nodes) >= 300:
         return 128, 2
     needed = np.median(BLOCK_BYTES * blocks + NODE_BYTES * nodes) + OTHER_BYTES
     return (128, 2) if shared / 4 < needed <= shared / 2 else (64, 4)
+
+
+def alone(nodes: Int64, blocks: Int64, count: Int64) -> bool:
+    """Returns whether each body is solved by one thread block, which then needs no exchanges (block_group.cuh).
+
+    nodes, blocks, count (bodies,): of each body, of its rows of A, and thread blocks
+    """
+    fits = nodes.max() <= 1 << COLUMN_BITS and blocks.max() < 1 << 31 - COLUMN_BITS  # into a word of spmv.cuh
+    return len(count) > 1 and bool(fits) and int(count.max()) == 1
 
 
 class PcgSolver:
@@ -107,10 +131,12 @@ class PcgSolver:
         nodes = spans[:, 1] - spans[:, 0]
         rows = np.diff(arrays["row_start"].astype(np.int64)[spans], axis=1)[:, 0]
         shared = gpu.properties["sharedMemPerMultiprocessor"]
-        self.threads, blocks = threads_and_blocks(nodes, rows, processors, shared)
+        exchanges = bool(phases or attempts or between or most_blocks)
+        self.threads, blocks = threads_and_blocks(nodes, rows, processors, shared, exchanges)
         assigned, most = best_assignment(nodes, processors, blocks)
         self.grid = most if assigned.pooled else int(assigned.blocks.sum())
         self.spared = processors - -(-self.grid // blocks)
+        self._alone = not exchanges and alone(nodes, rows, assigned.blocks)
         self.bodies = np.zeros(len(ranges), PCG_BODY)
         self.bodies["first"], self.bodies["nodes"] = spans[:, 0], nodes
         self.bodies["blocks"] = assigned.blocks
@@ -121,13 +147,15 @@ class PcgSolver:
         else:
             partition = halo(spans, assigned.blocks, *pattern)
             lists, read = lists_of(partition), len(partition.nodes)
+        if self._alone:
+            lists |= mirrored(partition, *pattern, self.threads // 32)
         self.bodies["first_range"] = partition.first
         self._rows = cp.zeros(self.bodies.nbytes, np.uint8)
         self.results: DeviceArray = cp.zeros(capacity * len(ranges) * PCG_RESULT.itemsize, np.uint8)
         self.pool_counter: DeviceArray = cp.zeros(max(attempts, 1), np.uint32)
         total, ints = len(arrays["row_start"]) - 1, np.int32
         self._work: dict[str, DeviceArray] = {
-            "order": cp.asarray(assigned.order.astype(ints)),
+            "order": cp.asarray(np.tile(assigned.order.astype(ints), 2)),
             "initial_range": cp.asarray(initial_ranges(assigned, partition, self.grid)),
             **{name: cp.asarray(array) for name, array in lists.items()},
             "halo_values": cp.zeros(3 * read, self.real), "halo_position": cp.zeros(read, ints),
@@ -207,6 +235,7 @@ class PcgSolver:
                 *(["-DERRORS"] if self.errors and name == "pcg" else []),
                 *(["-DBUDGETS"] if self.budgets and name == "pcg" else []),
                 *(["-DCUTS"] if self._cut and name == "pcg" else []),
+                *(["-DALONE"] if self._alone and name == "pcg" else []),
                 *(["-DSPLITS"] if self.followed else []),
             ),
             backend="nvrtc",

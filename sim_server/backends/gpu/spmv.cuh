@@ -8,11 +8,29 @@
 #endif
 #include "invert3.cuh"
 
+#ifndef TOGETHER
 #define TOGETHER 3                   // rows that a warp multiplies at a time
+#endif
+#ifndef SLAB_ROWS
 #define SLAB_ROWS 4                  // likewise in a slab
+#endif
 #define SLAB (SLAB_ROWS * WARPS)     // rows that are copied to shared memory at a time if not all fit
 #define SLABS 2                      // buffers of a slab, used in turns
 #define SLAB_BLOCKS (17 * SLAB)      // most blocks of A in a slab; a slab with more is read from global memory
+
+#ifdef ALONE
+// A is symmetric to the bit, so that the blocks on and above its diagonal are enough: they are kept in shared memory, all of them or
+// those of a window of rows that moves down. Each block of A has a word: 65536 times the rank of the block that is kept, among
+// those of the body; whether it is transposed; its column.
+#define WARP_ROWS 8                  // rows that a warp multiplies at a time, each by four lanes
+#define WINDOW_ROWS (WARP_ROWS * WARPS)  // of a slab of the window
+#define WINDOW_BLOCKS (17 * WINDOW_ROWS) // most blocks of A in it
+#define AHEAD 1                      // slabs on their way while one is multiplied
+#define COLUMN 0x7fff
+#define TRANSPOSED 0x8000
+#else
+#define COLUMN -1
+#endif
 
 struct BlockRows {
     int begin, own, halo;  // own nodes [begin, begin + own) of the body; nodes read
@@ -31,6 +49,12 @@ struct BlockRows {
     bool near;             // the rows of A are in shared memory
     int slabs;             // offset of the buffers (SLABS, SLAB_BYTES) in shared memory, or -1
     int near_values, near_blocks, near_columns;  // offsets in shared memory, if they are there
+#ifdef ALONE
+    int ring;              // blocks for which the window has room, 0: there is none
+    bool whole;            // all blocks are in it
+    const int* upper;      // (own + 1,) rank of the first block of each row
+    const int* lowest;     // (slabs,) rank of the first block of the window of each slab
+#endif
 
     // Position from which the values of a node of the halo are read.
     __device__ __forceinline__ int position(int node) const {
@@ -56,19 +80,36 @@ struct BlockRows {
 #else
         constexpr int KEPT = 0;
 #endif
-        bring(s, (int)row, range, arena, (inverted ? 12 + KEPT : 9 + KEPT) * own * (int)sizeof(real) + 64);
+        const int others = (inverted ? 12 + KEPT : 9 + KEPT) * own * (int)sizeof(real) + 64;
+#ifdef ALONE
+        if (!bring_upper(s, (int)row, range, arena, others))
+#endif
+            bring(s, (int)row, range, arena, others);
         scale = inverted ? arena.take<real>(3 * own) : nullptr;
         r = taken(arena, s.own_vectors + 3 * row + all);
         q = taken(arena, s.own_vectors + 3 * row + 2 * all);
+#ifdef ALONE  // of all vectors it is used least
+        x = whole ? taken(arena, s.own_vectors + 3 * row) : s.own_vectors + 3 * row;
+#else
         x = taken(arena, s.own_vectors + 3 * row);
+#endif
 #ifdef ERRORS
         before = taken(arena, s.own_vectors + 3 * row + 3 * all);
 #endif
+#ifndef ALONE  // else the nodes are all those of the body
         int* list = arena.take<int>(halo);
         if (!list) return;
         for (int k = threadIdx.x; k < halo; k += THREADS) copy_async(list + k, nodes + k, 4);
         nodes = list;
+#endif
         copies_begin();
+    }
+    __device__ __forceinline__ int node(int k) const {
+#ifdef ALONE
+        return k;
+#else
+        return nodes[k];
+#endif
     }
     __device__ __forceinline__ real* taken(Arena& arena, real* instead) const {
         real* found = arena.take<real>(3 * own);
@@ -77,18 +118,23 @@ struct BlockRows {
 
     // Copies the own rows of A into shared memory if they and `others` bytes fit, since loads after a barrier miss L1.
     __device__ __forceinline__ void bring(const PcgArguments& s, int row, const RowRange& range, Arena& arena, int others) {
-        const int count = range.blocks;
+        [[maybe_unused]] const int count = range.blocks;
         base = range.block_first;
         row_start = s.row_start + row;
         columns = s.local_column + base;
         blocks = s.values + 9ll * base;
         slabs = -1;
         Arena before = arena;
+#ifdef ALONE
+        near = false;
+        int* start;
+#else
         real* v = arena.take<real>(9 * count);
         int *c = arena.take<int>(count), *start = arena.take<int>(own + 1);
         near = v && c && start && near_values >= 0 && arena.end - arena.next >= others;
         near_blocks = place_of(v);
         near_columns = place_of(c);
+#endif
         if (!near) {
             arena = before;
             start = arena.take<int>(own + 1);
@@ -96,11 +142,13 @@ struct BlockRows {
         }
         if (start)
             for (int k = threadIdx.x; k <= own; k += THREADS) copy_async(start + k, row_start + k, 4);
+#ifndef ALONE
         if (near) {
             for (int k = threadIdx.x; k < 9 * count; k += THREADS) copy_async(v + k, blocks + k, sizeof(real));
             for (int k = threadIdx.x; k < count; k += THREADS) copy_async(c + k, columns + k, 4);
             blocks = v; columns = c;
         }
+#endif
         copies_begin();
         if (slabs >= 0)
             for (int k = 0; k < SLABS - 1; ++k) ask(k, row_start);
@@ -111,8 +159,9 @@ struct BlockRows {
 
     struct Slab { int low, high, first, count; };  // rows, and their range in `blocks`
 
+    template <int ROWS = SLAB>
     __device__ __forceinline__ Slab slab(int k, const int* starts) const {
-        const int low = min(k * SLAB, own), high = min(low + SLAB, own);
+        const int low = min(k * ROWS, own), high = min(low + ROWS, own);
         return {low, high, starts[low] - base, starts[high] - starts[low]};
     }
 
@@ -132,13 +181,154 @@ struct BlockRows {
         for (int k = 16 * threadIdx.x; k < skipped + bytes; k += 16 * THREADS) copy_async(to + k, begin + k, 16);
     }
 
+#ifdef ALONE
+    static constexpr int WORD_BYTES = 4 * WINDOW_BLOCKS + 16;
+
+    // Allocates the window, and begins to fill it. Returns false if it does not fit.
+    __device__ __forceinline__ bool bring_upper(const PcgArguments& s, int row, const RowRange& range, Arena& arena, int others) {
+        const int *ranks = s.upper_start + row + range.body, count = (own + WINDOW_ROWS - 1) / WINDOW_ROWS;
+        Arena before = arena;
+        ring = 0;
+        whole = false;
+        int *starts = arena.take<int>(own + 1), *uppers = arena.take<int>(own + 1), *firsts = arena.take<int>(count);
+        const Arena rest = arena;
+        real* v = arena.take<real>(9 * range.upper);
+        int* c = arena.take<int>(range.blocks);
+        whole = v && c && arena.end - arena.next >= others;
+        if (!whole) {
+            arena = rest;
+            v = arena.take<real>(9 * range.window);
+            c = (int*)arena.take<char>((AHEAD + 1) * WORD_BYTES);
+        }
+        if (!starts || !uppers || !firsts || !v || !c || near_values < 0 || range.window == 0) {
+            arena = before;
+            whole = false;
+            return false;
+        }
+        base = range.block_first;
+        row_start = s.row_start + row;
+        columns = s.local_column + base;
+        blocks = s.values + 9ll * base;
+        near_blocks = place_of(v);
+        near_columns = place_of(c);
+        ring = whole ? range.upper : range.window;
+        for (int k = threadIdx.x; k <= own; k += THREADS) {
+            copy_async(starts + k, row_start + k, 4);
+            copy_async(uppers + k, ranks + k, 4);
+        }
+        for (int k = threadIdx.x; k < count; k += THREADS) firsts[k] = ranks[s.lowest_row[row + k * WINDOW_ROWS]];
+        if (whole)
+            for (int k = threadIdx.x; k < range.blocks; k += THREADS) copy_async(c + k, columns + k, 4);
+        copies_begin();
+        row_start = starts; upper = uppers; lowest = firsts;
+        copies_end<0>();
+        __syncthreads();
+        if (whole) {
+            ask_rows(0, own, 0, 0);
+            copies_begin();
+        } else {
+            for (int k = 0; k < AHEAD; ++k) ask_upper(k, 0, 0);
+        }
+        return true;
+    }
+
+    // Place in the window of a block, by its rank, where the block of rank `first` is at `at`.
+    __device__ __forceinline__ int placed(int rank, int first, int at) const {
+        const int place = rank - first + at;
+        return place < ring ? place : place - ring;
+    }
+
+    // Begins to copy the blocks of rows from the diagonal on, a row by each warp.
+    __device__ __forceinline__ void ask_rows(int low, int high, int first, int at) const {
+        const int lane = threadIdx.x % 32;
+        real* window = (real*)(shared_memory + near_blocks);
+        for (int row = low + (int)threadIdx.x / 32; row < high; row += WARPS) {
+            const int rank = upper[row], count = 9 * (upper[row + 1] - rank), place = placed(rank, first, at), room = 9 * (ring - place);
+            const real* from = blocks + 9ll * (row_start[row + 1] - base) - count;
+            for (int k = lane; k < count; k += 32) copy_async(window + 9 * place + (k < room ? k : k - 9 * ring), from + k, sizeof(real));
+        }
+    }
+
+    // Begins to copy a slab into the window, and its words.
+    __device__ __forceinline__ void ask_upper(int k, int first, int at) const {
+        const Slab s = slab<WINDOW_ROWS>(k, row_start);
+        if (s.low < s.high) {
+            ask_rows(s.low, s.high, first, at);
+            all_of(shared_memory + near_columns + k % (AHEAD + 1) * WORD_BYTES, columns + s.first, 4 * s.count);
+        }
+        copies_begin();
+    }
+
+    // The window moves down A. Its first slabs for the next product are copied after this one, beside other work.
+    template <class Done>
+    __device__ __forceinline__ void through_window(Done done) const {
+        const int count = (own + WINDOW_ROWS - 1) / WINDOW_ROWS;
+        for (int k = 0; k < count; ++k) {
+            const Slab s = slab<WINDOW_ROWS>(k, row_start);
+            int origin = base, first = 0, at = 0, c = near_columns;
+            if (!whole) {
+                copies_end<AHEAD - 1>();
+                __syncthreads();  // this slab is complete, and the one before is not read any more
+                first = lowest[k];
+                at = first % ring;
+                ask_upper(k + AHEAD, first, at);
+                origin += s.first;
+                c += k % (AHEAD + 1) * WORD_BYTES + (int)((unsigned long long)(columns + s.first) & 15);
+            }
+            of_window(s.low + WARP_ROWS * (int)(threadIdx.x / 32), s.high, origin, c, first, at, done);
+        }
+        if (whole) return;
+        __syncthreads();
+        for (int k = 0; k < AHEAD; ++k) ask_upper(k, 0, 0);
+    }
+
+    // Rows low, low + 1, ... of a warp: lane 4 n + h adds every fourth block of the n-th, from the h-th on. c_at: offset of the words from
+    // the block on that is `origin`-th. first, at: of the window (placed).
+    template <class Done>
+    __device__ __forceinline__ void of_window(int low, int end, int origin, int c_at, int first, int at, Done done) const {
+        const real *a_of = shared_at<real>(near_blocks), *v_of = shared_at<real>(near_values);
+        const int* c_of = shared_at<int>(c_at);
+        const int lane = threadIdx.x % 32, h = lane % 4, node = low + lane / 4, size = ring;
+        int k = 0, last = 0;
+        if (node < end) {
+            k = row_start[node] - origin + h;
+            last = row_start[node + 1] - origin;
+        }
+        real sum[3] = {0, 0, 0};
+#pragma unroll 2
+        for (; k < last; k += 4) {
+            const unsigned word = c_of[k];
+            const bool transposed = word & TRANSPOSED;
+            int place = (int)(word >> 16) - first + at;
+            place -= place < size ? 0 : size;
+            const int row = transposed ? 1 : 3, column = transposed ? 3 : 1;
+            const real *a = a_of + 9 * place, *v = v_of + 3 * (word & COLUMN), v0 = v[0], v1 = v[1], v2 = v[2];
+            sum[0] += a[0] * v0 + a[column] * v1 + a[2 * column] * v2;
+            sum[1] += a[row] * v0 + a[4] * v1 + a[row + 2 * column] * v2;
+            sum[2] += a[2 * row] * v0 + a[2 * row + column] * v1 + a[8] * v2;
+        }
+#pragma unroll
+        for (int r = 0; r < 3; ++r) {
+            sum[r] += __shfl_xor_sync(ALL, sum[r], 1);
+            sum[r] += __shfl_xor_sync(ALL, sum[r], 2);
+        }
+        if (node < end && h < 3) done(node, h, h == 0 ? sum[0] : h == 1 ? sum[1] : sum[2]);
+    }
+#endif
+
     // q = A values for the own nodes. done(node, c, q): entry c of a node's, called by as many lanes as there are.
     template <class Done>
     __device__ __forceinline__ void multiply(Done done) const {
+#ifdef ALONE
+        if (ring > 0) through_window(done);
+        else if (slabs >= 0) through_slabs(done);
+        else some_rows<TOGETHER, false>(done);
+#else
         if (slabs >= 0) through_slabs(done);
         else if (!near) some_rows<TOGETHER, false>(done);
         else if (own <= WARPS) some_rows<1, true>(done);
         else some_rows<TOGETHER, true>(done);
+#endif
     }
 
     template <int N, bool NEAR, class Done>
@@ -212,12 +402,12 @@ struct BlockRows {
 #pragma unroll
             for (int e = 0; e < 16; e += 8) {
                 const int k = low + e + entry, there = min(k, high - 1);
-                const real *a = a_of + 9 * there + 3 * r, *v = v_of + 3 * c_of[there];
+                const real *a = a_of + 9 * there + 3 * r, *v = v_of + 3 * (c_of[there] & COLUMN);
                 const real product = a[0] * v[0] + a[1] * v[1] + a[2] * v[2];
                 sum[n] += lane < 24 && k < high ? product : 0;
             }
             for (int k = low + 16 + entry; k < high && lane < 24; k += 8) {
-                const real *a = a_of + 9 * k + 3 * r, *v = v_of + 3 * c_of[k];
+                const real *a = a_of + 9 * k + 3 * r, *v = v_of + 3 * (c_of[k] & COLUMN);
                 sum[n] += a[0] * v[0] + a[1] * v[1] + a[2] * v[2];
             }
         }
@@ -237,11 +427,11 @@ struct BlockRows {
 #pragma unroll
             for (int e = 0; e < 15; e += 3) {
                 const int k = low + e + entry, there = min(k, high - 1);
-                const real product = blocks[9ll * there + lane % 9] * values[3 * __ldg(columns + there) + c];
+                const real product = blocks[9ll * there + lane % 9] * values[3 * (__ldg(columns + there) & COLUMN) + c];
                 sum[n] += lane < 27 && k < high ? product : 0;
             }
             for (int k = low + 15 + entry; k < high && lane < 27; k += 3)
-                sum[n] += blocks[9ll * k + lane % 9] * values[3 * __ldg(columns + k) + c];
+                sum[n] += blocks[9ll * k + lane % 9] * values[3 * (__ldg(columns + k) & COLUMN) + c];
         }
 #pragma unroll
         for (int n = 0; n < N; ++n) {

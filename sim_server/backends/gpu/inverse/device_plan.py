@@ -151,6 +151,7 @@ class DevicePlan:
         params = np.zeros((), DEVICE_PLAN)
         params["phases"], params["blocks"], params["groups"] = plan.phases, plan.blocks, plan.groups
         params["size"], params["entries"] = plan.size, plan.x_area
+        params["contributions"] = self._contributions
         for name, array in self.arrays.items():
             params[name] = array.data.ptr
         self._params = gpu.cp.asarray(params.reshape(1).view(np.uint8))

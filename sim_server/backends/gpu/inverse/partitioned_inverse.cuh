@@ -12,9 +12,15 @@
 #define CHUNKS_AT_ONCE 4
 #endif
 constexpr int TILE_SUMS = 64;  // most partial products of shared tiles in a phase
+constexpr int PADDING = 32;    // entries behind vectors, to which padding refers
 #define LISTS 32768   // most bytes of a list that is copied to shared memory
-#define FEW 3         // segments that a warp loads at a time, for short lists
+#ifdef ALONE          // words are at hand: few registers matter more
+#define FEW 2         // segments that a warp loads at a time, for short lists
+#define MANY 4
+#else
+#define FEW 3
 #define MANY 8        // 2304 entries in one trip through L2 with 8 warps
+#endif
 
 // 2^-k with sqrt(a) 2^-k < 1.
 __device__ __forceinline__ float unit_for(double a) {
@@ -61,6 +67,12 @@ __device__ __forceinline__ uint4 shared_load(unsigned from, bool wanted) {
         "{.reg .pred p; setp.ne.s32 p, %5, 0; mov.b32 %0, 0; mov.b32 %1, 0; mov.b32 %2, 0; mov.b32 %3, 0;\n"
         "@p ld.shared.v4.u32 {%0, %1, %2, %3}, [%4];}"
         : "=r"(v.x), "=r"(v.y), "=r"(v.z), "=r"(v.w) : "r"(from), "r"((int)wanted));
+    return v;
+}
+
+__device__ __forceinline__ uint4 shared_vector_load(unsigned from) {
+    uint4 v;
+    asm volatile("ld.shared.v4.u32 {%0, %1, %2, %3}, [%4];" : "=r"(v.x), "=r"(v.y), "=r"(v.z), "=r"(v.w) : "r"(from));
     return v;
 }
 
@@ -111,16 +123,34 @@ struct PartitionedInverse {
         size = plan->size; phases = plan->phases; groups = plan->groups;
         vector.high = arena.take<unsigned short>(shared_plan->entries);
         vector.low = arena.take<unsigned short>(shared_plan->entries);
+#ifndef ALONE
         tile_sums = arena.take<float>(16 * TILE_SUMS);
+#endif
         const BlockRanges part = plan->block_ranges[index];
         lists = brought(plan->lists + index * (4 * phases + 2), 4 * phases + 2, arena);
         tiles = brought(plan->tiles + part.tile, part.tiles, arena);
     }
 
+#ifdef ALONE
+    // Moves words into shared memory if they fit.
+    static __device__ __forceinline__ void words(FlagWord<float>*& at, int count, Arena& arena) {
+        FlagWord<float>* found = arena.take<FlagWord<float>>(count);
+        if (found) at = found;
+    }
+#endif
+
     __device__ __forceinline__ void set_up(const PcgBody& body, int index, Arena& arena) {
         scale = body.scale; planes = body.planes;
         residual = body.residual; product = body.product; z = body.z;
         formed = body.formed; solved = body.solved; contributed = body.contributed;
+#ifdef ALONE
+        words(residual, 2 * (size + PADDING), arena);
+        words(product, size + PADDING, arena);
+        words(z, size + PADDING, arena);
+        words(solved, size + PADDING, arena);
+        words(contributed, plan->contributions, arena);
+        words(formed, size + PADDING, arena);
+#endif
         const BlockRanges part = plan->block_ranges[index];
         segments = brought(plan->segments + part.segment, part.segments, arena);
         where = brought(plan->index + 32ll * part.segment, 32 * part.segments, arena);
@@ -145,6 +175,11 @@ struct PartitionedInverse {
         if (phase == 0) {
             if (formed_here <= FEW * WARPS) residual_segments<FEW>(first + warp, middle, from, number, unit);
             else for (int k = first + warp; k < middle; k += MANY * WARPS) residual_segments<MANY>(k, middle, from, number, unit);
+#ifdef ALONE
+        } else {
+            for (int k = first + warp; k < middle; k += WARPS) reduced_segments<1, 6>(k, middle, from, number, unit);
+        }
+#else
         } else if (formed_here > FEW * WARPS) {
             for (int k = first + warp; k < middle; k += 2 * WARPS) reduced_segments<2, 6>(k, middle, from, number, unit);
         } else if (formed_here > WARPS) {
@@ -152,6 +187,7 @@ struct PartitionedInverse {
         } else {
             reduced_segments<1, 12>(first + warp, middle, from, number, unit);
         }
+#endif
         if (last - middle <= FEW * WARPS) solved_segments<FEW>(middle + warp, last, number, unit);
         else for (int k = middle + warp; k < last; k += MANY * WARPS) solved_segments<MANY>(k, last, number, unit);
     }
@@ -274,6 +310,145 @@ struct PartitionedInverse {
             if (at + k * WARPS < last) put_halves(vector, segments[at + k * WARPS].to + lane, unit * v[k]);
     }
 
+#ifdef ALONE
+    // Chunks of a tile on their way to a warp: of its upper eight rows, and of its lower ones.
+    struct Group {
+        uint4 upper[CHUNKS_AT_ONCE], lower[CHUNKS_AT_ONCE];
+        int phase, x, count;  // of the tile; first entry of the vector; chunks
+        int rows, out;        // of a tile's last group: its rows, else 0; where this lane's row goes
+        float scale;          // likewise: its scale
+        bool last;            // of a plane
+    };
+
+    // The groups of a warp, one after another through all phases: three of them are on their way while one is multiplied, also from one
+    // phase to the next.
+    struct Stream {
+        Group group[3];
+        int turn, phase, job, plane, at;
+    };
+
+    __device__ __forceinline__ void open(Stream& s) const {
+        s.turn = s.phase = s.plane = s.at = 0;
+        s.job = threadIdx.x / 32;
+#pragma unroll
+        for (int n = 0; n < 3; ++n) {
+#pragma unroll
+            for (int k = 0; k < CHUNKS_AT_ONCE; ++k) s.group[n].upper[k] = s.group[n].lower[k] = make_uint4(0, 0, 0, 0);
+            ask(s, s.group[n]);
+        }
+    }
+
+    __device__ __forceinline__ void ask(Stream& s, Group& g) const {
+        while (s.phase < phases && s.job >= lists[phases + 2 + s.phase] - lists[phases + 1 + s.phase]) {
+            ++s.phase;
+            s.job = threadIdx.x / 32;
+        }
+        g.phase = s.phase;
+        if (s.phase == phases) return;
+        const Tile tile = tiles[lists[phases + 1 + s.phase] + s.job];
+        const int from = tile.chunk - begin + s.plane * tile.chunks + s.at, lane = threadIdx.x % 32;
+        g.count = min(CHUNKS_AT_ONCE, tile.chunks - s.at);
+        g.x = tile.x + 32 * s.at;
+        g.rows = 0;
+        const int second = tile.rows > 8 ? tile.chunks * planes : 0;  // rows that a tile has not are not used
+        if (from + second + g.count <= near) {
+            const unsigned a = shared_address(kept + lane) + 512 * from, b = a + 512 * second;
+#pragma unroll
+            for (int k = 0; k < CHUNKS_AT_ONCE; ++k)
+                if (k < g.count) {
+                    g.upper[k] = shared_vector_load(a + 512 * k);
+                    g.lower[k] = shared_vector_load(b + 512 * k);
+                }
+        } else {
+            const uint4 *a = matrix + 32ll * from + lane, *b = a + 32 * second;
+#pragma unroll
+            for (int k = 0; k < CHUNKS_AT_ONCE; ++k)
+                if (k < g.count) {
+                    g.upper[k] = __ldg(a + 32 * k);
+                    g.lower[k] = __ldg(b + 32 * k);
+                }
+        }
+        s.at += CHUNKS_AT_ONCE;
+        g.last = s.at >= tile.chunks;
+        if (!g.last) return;
+        s.at = 0;
+        if (++s.plane < planes) return;
+        g.rows = tile.rows;
+        g.out = tile.out + min(lane, tile.rows - 1);
+        if (s.phase < groups - 1) g.out = __ldg(plan->target + g.out);
+        else g.scale = __ldg(scale + g.out);
+        s.plane = 0;
+        s.job += WARPS;
+    }
+
+    // Products of a phase; returns this thread's part of z . r.
+    __device__ __forceinline__ double multiply(int phase, const ResidualSource& from, unsigned number, float unit, Stream& s) const {
+        const int lane = threadIdx.x % 32;
+        const bool forward = phase < groups - 1;
+        const float back = 1 / unit;
+        float sum[2][4] = {}, total = 0, weight = 1;
+        double zr = 0;
+        auto take = [&](Group& g) {
+            const unsigned half = shared_address((lane & 4 ? vector.low : vector.high) + g.x + 8 * (lane % 4));
+            uint4 v[CHUNKS_AT_ONCE];  // of its eight columns two are used: what the other lanes load does not matter
+#pragma unroll
+            for (int k = 0; k < CHUNKS_AT_ONCE; ++k) v[k] = shared_vector_load(half + 64 * min(k, g.count - 1));
+#pragma unroll
+            for (int k = 0; k < CHUNKS_AT_ONCE; ++k)
+                if (k < g.count) {
+                    const uint4 m = g.upper[k], n = g.lower[k];
+                    multiply_add(sum[0], m.x, n.x, m.y, n.y, v[k].x, v[k].y);
+                    multiply_add(sum[1], m.z, n.z, m.w, n.w, v[k].z, v[k].w);
+                }
+            const bool last = g.last;
+            const int rows = g.rows, i = g.out;
+            const float d = g.scale;
+            ask(s, g);
+            if (!last) return;
+            const float above = sum[0][0] + sum[1][0] + (sum[0][1] + sum[1][1]) / LOW;  // lane 4 r: row r
+            const float below = sum[0][2] + sum[1][2] + (sum[0][3] + sum[1][3]) / LOW;  // and row r + 8
+            const float one = __shfl_sync(ALL, above, 4 * (lane % 8)), two = __shfl_sync(ALL, below, 4 * (lane % 8));
+            total += weight * (lane & 8 ? two : one);
+            weight /= LOW;
+            for (int k = 0; k < 4; ++k) sum[0][k] = sum[1][k] = 0;
+            if (rows == 0) return;
+            const float value = back * total;
+            total = 0;
+            weight = 1;
+            if (lane >= rows) return;
+            if (forward) {
+                contributed[i].put(value, number);
+                return;
+            }
+            solved[i].put(value, number);
+            z[i].put(d * value, number);
+            if (d == 0) return;  // padding
+            float ri, qi = 0;
+            from.r[i].get(ri, from.r_number);
+            if (from.alpha != 0) product[i].get(qi, from.q_number);
+            zr += (double)value * (ri - from.alpha * qi);
+        };
+        for (;;) {
+            if (s.turn == 0) {
+                if (s.group[0].phase != phase) break;
+                take(s.group[0]);
+                __syncwarp();
+                s.turn = 1;
+            }
+            if (s.turn == 1) {
+                if (s.group[1].phase != phase) break;
+                take(s.group[1]);
+                __syncwarp();
+                s.turn = 2;
+            }
+            if (s.group[2].phase != phase) break;
+            take(s.group[2]);
+            __syncwarp();
+            s.turn = 0;
+        }
+        return zr;
+    }
+#else
     // Sums over chunks [from, to) of this block's storage, and over those `second` further on, of the next eight rows; the
     // vector begins at `x`.
     template <bool NEAR>
@@ -377,4 +552,5 @@ struct PartitionedInverse {
         }
         return zr;
     }
+#endif
 };
