@@ -237,7 +237,7 @@ class BodyUpdateState:
         job = self.job
         if self._end_check(factor.step) or (job.in_flight and factor.step == job.sent):
             self.factors.latency.add(max(1, step - factor.step))
-        job.in_flight, self.failures.in_a_row = job.in_flight and job.sent > factor.step, 0
+        job.in_flight, self.failures.in_a_row = job.in_flight and (job.sent or 0) > factor.step, 0
         if job.positions:
             self.failures.assemblies = 0
         if factor.step <= self.factors.newest:

@@ -542,7 +542,7 @@ def test_what_becomes_of_a_factor_says_nothing_of_the_job_after_it(overlapping, 
 
 
 def test_no_matrix_goes_ahead_of_a_check_after_a_refused_factor_and_none_under_adaptive(overlapping):
-    driver, source, (second, _), _ = overlapping
+    driver, _, (second, _), _ = overlapping
     state = driver.bodies[0]
     state.job.in_flight, driver._behind = False, []
     ahead = driver.requests(ahead=True)
