@@ -132,6 +132,7 @@ class LoopState(Protocol):
     hold: number of a request to stand still between two steps, 0: none; held: the last one that it has followed
     frame_every, energy_every: steps between those that are reported, 0: none
     deadline: of the next step, 0: at once [s]
+    wake: descriptor (eventfd) to which it writes when a matrix that was asked for is there; 0: none
     record_capacity: records that find room
     late_steps, frames_dropped, records_dropped, others_dropped (reactions on what is no obstacle): numbers so far
     """
@@ -147,6 +148,7 @@ class LoopState(Protocol):
     hold: int
     held: int
     deadline: float
+    wake: int
     frame_every: int
     energy_every: int
     record_capacity: int

@@ -88,6 +88,7 @@ class Driver:
         self.reactions: Float64 = np.zeros((0, 0, 6))
         self.other_reactions: NDArray[Any] = np.zeros(0, REACTION)
         self.readings: Float64 = np.zeros((0, 0))
+        self.wake: Callable[[], None] = lambda: None  # called in another thread when `pump` has something to take up
         self.on_adopt: list[Callable[[Factor], Any]] = []  # called with every factor that the loop is given
         self.on_epoch: list[Callable[[Body, int], None]] = []  # called before the first job of an epoch of a body
         self.snapshots = SnapshotPool(simulation, self.source, self.policy.expected_latency)
@@ -264,6 +265,7 @@ class Driver:
             self.by_name[factor.object].on_check(factor.step)
         applied = self._prepare(factors[0]) if len(factors) == 1 else None
         reasons = self._checker.submit(self.check.reject_reasons, checked, applied)
+        reasons.add_done_callback(lambda _: self.wake())
         self.checks.append(FactorsUnderCheck(factors, [memory for memory, _ in held], reasons))
 
     def _prepare(self, factor: Factor) -> Callable[[], Float64 | None] | None:

@@ -470,12 +470,16 @@ def sent(monkeypatch) -> tuple[Driver, Factor, threading.Event]:
 
 def test_large_factors_are_checked_beside_the_steps(sent):
     driver, factor, go = sent
+    woken = threading.Event()
+    driver.wake = woken.set
     memory = driver.bodies[0].job.matrix[1]
     driver.adopt([factor])
     assert driver.advance(2)["factor_step"].tolist() == [-1, -1]
+    assert not woken.is_set()
     assert all(memory is not free for kept in driver.snapshots.free.values() for free in kept), "it is being read"
     go.set()
     wait([each.reasons for each in driver.checks])
+    assert woken.wait(60)
     assert driver.advance(1)["factor_step"].tolist() == [factor.step]
     assert any(memory is free for kept in driver.snapshots.free.values() for free in kept)
     assert driver.bodies[0].factors.used == 1 and driver.checks == []
