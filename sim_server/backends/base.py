@@ -261,6 +261,10 @@ class Engine(Protocol):
         """
         ...
 
+    def may_prepare(self, body: int) -> bool:
+        """False while a factor of a body before has no step yet, so that another one would have to wait."""
+        ...
+
     def drop_factor(self, body: int, factor: Factor) -> None:
         """Gives up a factor that may have been prepared, and is not posted."""
         ...
