@@ -2,6 +2,7 @@
 """Complete factorizations on the GPU."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -57,6 +58,11 @@ class GpuFactorization:
             return values
         np.copyto(out, values)
         return out
+
+    def make_ready(self, dtype: np.dtype[Any]) -> None:
+        """Takes memory and makes the launches for matrices one by one, and tries them with a matrix of zeros, so that
+        page-locked memory for L is there and the device has all that it loads at first use."""
+        self.executor(dtype.name).run([np.zeros((self.plan.blocks, 3, 3))])
 
     def begin_many(self, matrices: Sequence[Float64], dtype: np.dtype[np.floating]) -> Together | None:
         """Begins to factorize up to `most` matrices in the launches of one; None if the device has too little memory.

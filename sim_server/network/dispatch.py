@@ -277,3 +277,4 @@ class Dispatch(FactorSource):
     def _on_pattern(self, sample: zenoh.Sample) -> None:
         if (new := self.decoder.add_pattern(sample.key_expr, sample.payload)) is not None:
             self._patterns = [*self._patterns, new][-MAX_NEW_PATTERNS:]
+            self._sender.prepare_for(new[1])

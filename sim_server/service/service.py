@@ -121,6 +121,14 @@ class Service:
             return None
         return FirstFactors(driver)
 
+    def ready(self) -> bool:
+        """False while a worker or the device makes ready for the first factors. Takes in what workers tell of them."""
+        if not self.driver.wants_factors:
+            return True
+        self.driver.expect_factors(self.link.dispatch)
+        idle = any(worker.idle for worker in self.link.dispatch.workers())
+        return idle and self.engine.expects_factors()
+
     def supervise(self, supervisor: "Supervisor") -> None:
         """Has the local workers of `supervisor` restarted, shown in the status, added and killed by clients."""
         self.check_workers, self.link.local_workers = supervisor.check, supervisor.local_workers
