@@ -50,7 +50,7 @@ Examples:
 """
 
 WORKER_TIMEOUT = 15.0  # s that the start waits for the first local worker, at most
-READY_TIMEOUT = 1.0  # s that it then waits until worker and device are ready for the first factors, at most
+READY_TIMEOUT = 3.0  # s that it then waits until worker and device are ready for the first factors, at most
 
 
 def list_gallery(asked: bool) -> None:

@@ -89,6 +89,11 @@ class Dispatch(FactorSource):
         """Has `wake` called, in another thread, when a factor that is taken in beside the caller is there."""
         self._intake.wake = wake
 
+    def makes_slots(self) -> bool:
+        """True while shared memory for arrays is being made beside the caller."""
+        with self._lock:
+            return self._pool is not None and self._pool.makes_any
+
     def announce(self, topology: Topology) -> None:
         """Begins a new epoch of an object; answers to jobs of the last one are refused."""
         with self._lock:

@@ -122,12 +122,14 @@ class Service:
         return FirstFactors(driver)
 
     def ready(self) -> bool:
-        """False while a worker or the device makes ready for the first factors. Takes in what workers tell of them."""
+        """False while a worker, shared memory or the device is made ready for the first factors. Takes in what workers
+        tell of them."""
         if not self.driver.wants_factors:
             return True
-        self.driver.expect_factors(self.link.dispatch)
-        idle = any(worker.idle for worker in self.link.dispatch.workers())
-        return idle and self.engine.expects_factors()
+        dispatch = self.link.dispatch
+        self.driver.expect_factors(dispatch)
+        idle = any(worker.idle for worker in dispatch.workers())
+        return idle and not dispatch.makes_slots() and self.engine.expects_factors()
 
     def supervise(self, supervisor: "Supervisor") -> None:
         """Has the local workers of `supervisor` restarted, shown in the status, added and killed by clients."""

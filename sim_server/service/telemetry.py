@@ -333,6 +333,7 @@ class Telemetry:
         """Begins to fetch the positions of all nodes for the next status; True once they are there."""
         if self._positions is None:
             self._positions = self.simulation.world.backend.begin_fetch(self.simulation.world.x)
+            self._positions.add_done_callback(lambda _: self.driver.wake())
         return self._positions.done()
 
     def _places(self) -> list[NamedPoints]:
