@@ -647,3 +647,26 @@ def test_parameters_are_copied_between_batches_all_together() -> None:
     scene.device.fail = "on_device"
     with pytest.raises(DeviceLost, match="on_device"):
         scene.loop.run(1)
+
+
+def test_a_matrix_in_the_memory_of_the_loop_is_not_copied_once_more():
+    """Memory of each body of its own, in which the next copy follows; a request with other memory is served as ever."""
+    scene = FakeScene(bodies=3)
+    scene.loop.run(20)
+    own, target = [scene.loop.copy_memory(k) for k in range(3)], np.full((2, 3, 3), np.nan)
+    assert all(scene.loop.copy_memory(k) is memory and memory.shape == (2, 3, 3) for k, memory in enumerate(own))
+    scene.loop.request_matrix(0, own[0])
+    scene.loop.request_matrix(2, own[2])
+    assert scene.loop.matrix_steps([0, 1, 2]).tolist() == [-1, -1, -1]
+    scene.loop.run(40)
+    assert scene.loop.matrix_steps([2, 1, 0]).tolist() == [20, -1, 20]
+    assert (own[0] == 20).all() and (own[2] == 20).all() and not own[1].any()
+    scene.loop.request_matrix(0, own[0])
+    scene.loop.request_matrix(1, target)
+    scene.loop.run(40)
+    assert scene.loop.matrix_steps([0, 1, 2]).tolist() == [60, 60, 20]
+    assert (own[0] == 60).all() and (target == 60).all() and (own[2] == 20).all()
+
+
+def test_matrices_of_another_type_have_no_memory_of_the_loop():
+    assert FakeScene(bodies=2, real="f4").loop.copy_memory(1) is None

@@ -11,7 +11,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from sim_server.arrays import Float64
+from sim_server.arrays import Float64, Int64
 from sim_server.backends.gpu import structs
 from sim_server.backends.gpu.mailbox import DeviceMailbox, library
 from sim_server.backends.gpu.structs import FRAME_COPIES, RECORD_TARGET
@@ -109,7 +109,9 @@ class DeviceLoop(Reports):
             entry.x_begin, entry.x_bytes = (3 * np.dtype(real).itemsize * k for k in (first, last - first))
         self._real, self._value_bytes = np.dtype(real), int(staged[-1])
         self._targets: dict[int, Float64] = {}
-        self._requested_bytes: dict[int, int] = {}  # by body
+        self._own_memory: dict[int, Float64] = {}  # by body
+        entries = np.ctypeslib.as_array(self._readbacks)
+        self._copied_steps, self._requests = entries["copied_step"], entries["requested"]
         loop.driver = c.addressof(device.functions)
         loop.context, loop.stream, loop.copy_stream = device.context, device.stream, device.copies
         loop.mail_slots, loop.mail_slot_count = c.addressof(self._slots), len(mailboxes)
@@ -250,23 +252,44 @@ class DeviceLoop(Reports):
             raise ValueError(f"positions of a GPU are copied as they are, not {ahead:g} s ahead")
         self._request(body, target, structs.REQUEST_POSITIONS)
 
-    def _request(self, body: int, target: Float64, request: int) -> None:
-        if not self.loop.staged:  # allocated at the first request
+    def copy_memory(self, body: int) -> Float64 | None:
+        """Returns the page-locked memory of the copies of a body's matrix, (blocks, 3, 3); None: of another type."""
+        if self._real != np.float64:
+            return None
+        if body not in self._own_memory:
+            begin = self._readbacks[body].staged_begin
+            memory = self._staging()[begin : begin + self._room[body]]
+            self._own_memory[body] = memory.view(np.float64).reshape(-1, 3, 3)
+        return self._own_memory[body]
+
+    def _staging(self) -> NDArray[Any]:
+        """Returns the page-locked memory of copies, made at the first request."""
+        if not self.loop.staged:
             self.loop.staged = self._device.memory(self._value_bytes)
             self._pinned_values = self._device.pinned(self._value_bytes)
             self.loop.host_matrices = self._pinned_values.ctypes.data
-        self._targets[body] = target
-        entry = self._readbacks[body]
-        entry.copied_step, entry.requested = -1, request
-        self._requested_bytes[body] = self._room[body] if request == structs.REQUEST_VALUES else entry.x_bytes
+        return self._pinned_values
+
+    def _request(self, body: int, target: Float64, request: int) -> None:
+        self._staging()
+        if target is not self._own_memory.get(body):
+            self._targets[body] = target
+        self._copied_steps[body] = -1
+        self._requests[body] = request  # last: from then on the loop copies
         self.loop.requested = 1
 
     def matrix_step(self, body: int) -> int:
         """Returns the step (steps completed before) of the copy requested last, -1 until it is complete."""
-        entry = self._readbacks[body]
-        step = int(entry.copied_step)
+        step = int(self._copied_steps[body])
         if step >= 0 and body in self._targets:
-            data = self._pinned_values[entry.staged_begin : entry.staged_begin + self._requested_bytes[body]]
-            target = self._targets.pop(body)
+            entry, target = self._readbacks[body], self._targets.pop(body)
+            data = self._pinned_values[entry.staged_begin :][: target.size * self._real.itemsize]
             target[...] = data.view(self._real).reshape(target.shape)
         return step
+
+    def matrix_steps(self, bodies: Sequence[int]) -> Int64:
+        """Returns the same of each of some bodies."""
+        if not self._targets:
+            steps: Int64 = self._copied_steps[list(bodies)]
+            return steps
+        return np.array([self.matrix_step(body) for body in bodies], np.int64)
