@@ -18,20 +18,21 @@ from numpy.typing import NDArray
 from protocol.validate import ALONE, all_finite, checksum, copied, helping_threads
 
 SOURCE = Path(__file__).with_name("copies.cpp")
+HASH = c.CFUNCTYPE(c.c_uint64, c.c_char_p, c.c_size_t)
 NAMES = ("XXH3_64bits_dispatch", "XXH3_64bits")  # the first one chooses the best instructions of the processor
 
 
 @cache
 def _hash() -> int | None:
     """Address of xxh3_64 in the library of the package xxhash; None if it does not offer it to others."""
-    library = c.CDLL(xxhash._xxhash.__file__)
-    sample = bytes(range(256)) * 9
+    library, sample = c.CDLL(xxhash._xxhash.__file__), bytes(range(256)) * 9
     for name in NAMES:
-        function = getattr(library, name, None)
-        if function is not None:
-            function.restype, function.argtypes = c.c_uint64, [c.c_char_p, c.c_size_t]
-            if function(sample, len(sample)) == xxhash.xxh3_64_intdigest(sample):
-                return c.cast(function, c.c_void_p).value
+        try:
+            address = c.cast(getattr(library, name), c.c_void_p).value
+        except AttributeError:
+            continue
+        if address and HASH(address)(sample, len(sample)) == xxhash.xxh3_64_intdigest(sample):
+            return address
     return None
 
 

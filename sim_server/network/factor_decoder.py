@@ -4,9 +4,11 @@
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 from weakref import WeakValueDictionary
 
 import numpy as np
+from numpy.typing import NDArray
 
 from protocol.channels import CHANNELS, MOST_JOBS, name_in
 from protocol.factor import Factor, FactorPattern, check_values
@@ -217,10 +219,10 @@ class FactorDecoder:
             return made
         values = self._copied([(job, pattern.nonzeros) for _, _, job, _, pattern in found])
         positive = _positive(values, [pattern for *_, pattern in found])
-        for (k, place, job, known, pattern), (each, *seen), good in zip(found, values, positive, strict=True):
+        for (k, place, job, known, pattern), (each, checked, finite), good in zip(found, values, positive, strict=True):
             told = columns.checksums[place], job, columns.seconds[place], columns.remedies[place]
             try:
-                made[k] = self._factor(known, pattern, each, *told, (seen[0], seen[1]), good)
+                made[k] = self._factor(known, pattern, each, *told, (checked, finite), good)
             except Refused as refusal:
                 made[k] = refusal
         return made
@@ -311,9 +313,11 @@ class _AnswerColumns:
 
     @classmethod
     def of(cls, message: FactorBatch) -> "_AnswerColumns":
-        columns = (list(each) for each in (message.seconds, message.nonzeros, message.patterns, message.checksums))
-        remedies, slot = list(message.remedies) or [""] * len(message.jobs), message.slot
-        return cls(*columns, remedies, (slot.segment, slot.offset, slot.generation))
+        slot, remedies = message.slot, list(message.remedies) or [""] * len(message.jobs)
+        return cls(
+            list(message.seconds), list(message.nonzeros), list(message.patterns), list(message.checksums), remedies,
+            (slot.segment, slot.offset, slot.generation),
+        )  # fmt: skip
 
 
 def _slot(job: InFlightJob) -> Slot:
@@ -342,7 +346,8 @@ def _positive(
     first, count = values[0][0], patterns[0].nonzeros
     if any(pattern is not patterns[0] for pattern in patterns):
         return [bool((each[0][p.diagonal] > 0).all()) for each, p in zip(values, patterns, strict=True)]
-    every = np.lib.stride_tricks.as_strided(first, (len(values), count), (first.nbytes, first.itemsize))
+    strides = first.nbytes, first.itemsize
+    every: NDArray[Any] = np.lib.stride_tricks.as_strided(first, (len(values), count), strides)
     return list((every[:, patterns[0].diagonal] > 0).all(axis=1).tolist())
 
 
