@@ -132,6 +132,7 @@ class LoopState(Protocol):
     hold: number of a request to stand still between two steps, 0: none; held: the last one that it has followed
     frame_every, energy_every: steps between those that are reported, 0: none
     deadline: of the next step, 0: at once [s]
+    wake: descriptor (eventfd) to which it writes when a matrix that was asked for is there; 0: none
     record_capacity: records that find room
     late_steps, frames_dropped, records_dropped, others_dropped (reactions on what is no obstacle): numbers so far
     """
@@ -147,6 +148,7 @@ class LoopState(Protocol):
     hold: int
     held: int
     deadline: float
+    wake: int
     frame_every: int
     energy_every: int
     record_capacity: int
@@ -261,6 +263,10 @@ class Engine(Protocol):
         """
         ...
 
+    def may_prepare(self, body: int) -> bool:
+        """False while a factor of a body before has no step yet, so that another one would have to wait."""
+        ...
+
     def drop_factor(self, body: int, factor: Factor) -> None:
         """Gives up a factor that may have been prepared, and is not posted."""
         ...
@@ -311,8 +317,8 @@ class Engine(Protocol):
         ...
 
     def copy_memory(self, body: int) -> Float64 | None:
-        """Returns the memory that the loop copies the matrix of a body to by itself, (blocks, 3, 3), in which the next
-        one follows: with it as target of `request_matrix` nothing is copied once more. None: there is none such."""
+        """Returns memory (blocks, 3, 3) that the loop brings the next matrix of a body to by itself: as target of
+        `request_matrix` it saves a copy. The matrix behind that one leaves it alone. None: there is none such."""
         ...
 
     def request_positions(self, body: int, target: Float64, ahead: float = 0.0) -> None:

@@ -85,6 +85,10 @@ class Dispatch(FactorSource):
         """Number of factors that are taken in beside the caller. A probe for tests."""
         return self._intake.decoded
 
+    def wake_by(self, wake: Callable[[], None]) -> None:
+        """Has `wake` called, in another thread, when a factor that is taken in beside the caller is there."""
+        self._intake.wake = wake
+
     def announce(self, topology: Topology) -> None:
         """Begins a new epoch of an object; answers to jobs of the last one are refused."""
         with self._lock:

@@ -5,7 +5,7 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import zenoh
 
@@ -18,6 +18,8 @@ from protocol.shared_memory.pool import Slot, SlotPool
 from sim_server.network.bookkeeping import Bookkeeping
 from sim_server.network.factor_fetch import AHEAD, FactorFetch
 from sim_server.network.leases import InFlightJob
+
+T = TypeVar("T")
 
 LARGE = 4 << 20  # bytes of a factor whose copy and checks take more than a few milliseconds
 FETCHES = 2  # factors that arrive in parts at a time, each in memory of its own
@@ -75,6 +77,7 @@ class FactorIntake:
         self._together: deque[tuple[DecodedTogether, Future[Results]]] = deque()  # likewise, oldest first
         self._beside: set[int] = set()  # numbers of their jobs
         self._fetches: set[int] = set()  # of these, the jobs whose factors come in parts
+        self.wake: Callable[[], None] = lambda: None  # called in another thread when a factor is decoded
 
     def fetched_from(self, worker: str) -> int:
         """Number of factors that are fetched from a worker part by part."""
@@ -110,7 +113,7 @@ class FactorIntake:
         decode = partial(self._book.decoder.decode, message, sample.payload, job)
         if not message.failure and 4 * message.nonzeros > LARGE:  # its bytes are copied and checked beside the caller
             self._refuse_second(job)
-            future = self._thread.submit(decode)
+            future = self._woken(self._thread.submit(decode))
             self._decoding[job.number] = Decoding(job, future, future.result, message.seconds, _slots_used(message))
             return
         self._take_factor(job, decode, message.failure, message.seconds, _slots_used(message))
@@ -137,7 +140,7 @@ class FactorIntake:
         decode = partial(self._book.decoder.decode_several, message, good)
         if 4 * sum(message.nonzeros) <= LARGE:
             return self._take_together(together, decode())
-        self._together.append((together, self._thread.submit(decode)))
+        self._together.append((together, self._woken(self._thread.submit(decode))))
         self._beside.update(job.number for job in together.jobs)
 
     def _matched(self, message: FactorBatch) -> dict[int, tuple[int, InFlightJob]]:
@@ -152,6 +155,11 @@ class FactorIntake:
             except Refused as refusal:
                 self._counters.refuse(refusal)
         return found
+
+    def _woken(self, future: Future[T]) -> Future[T]:
+        """Has who takes in factors woken at the end of a decoding."""
+        future.add_done_callback(lambda _: self.wake())
+        return future
 
     def _note_answer(self, worker: str) -> None:
         self._book.free_since[worker] = self._book.clock()
@@ -171,7 +179,7 @@ class FactorIntake:
             self._slots_for_parts(job),
         )  # fmt: skip
         decode = partial(self._book.decoder.decode, message, b"", job, fetch.run)
-        future, by_slot = self._fetching.submit(decode), _slots_used(message, fetch)
+        future, by_slot = self._woken(self._fetching.submit(decode)), _slots_used(message, fetch)
         self._decoding[job.number] = Decoding(job, future, future.result, message.seconds, by_slot, fetch=fetch)
         self._fetches.add(job.number)
 

@@ -24,6 +24,7 @@ GRAPH_STEPS = (1, 2, 8)  # of which there are graphs
 CAPACITY = 64  # steps whose results are kept; more than can be under way
 FRAMES = 8  # in the ring
 BATCH_SECONDS = 2e-3  # aim for the duration of a batch [s]; requests wait for two batches at most
+DOUBLED = 512 << 20  # bytes of the matrices of all bodies, up to which each has two places for copies
 POLL = 1e-5  # interval between queries of an event [s]
 
 
@@ -101,7 +102,9 @@ class DeviceLoop(Reports):
         self._readbacks, block = (structs.BodyReadback * bodies)(), 9 * np.dtype(real).itemsize
         most = most_blocks or [int(row_start[last] - row_start[first]) for first, last in ranges]
         self._room = [block * count for count in most]  # bytes of the blocks of each body at most
-        staged = np.cumsum([0, *self._room])
+        self._places = sum(self._room) <= DOUBLED  # two for the copies of each body
+        staged = np.cumsum([0, *((1 + self._places) * room for room in self._room)])
+        self._staged_begin = [int(begin) for begin in staged]  # of the first one of each
         for entry, (first, last), own in zip(self._readbacks, ranges, staged, strict=False):
             begin, end = block * int(row_start[first]), block * int(row_start[last])
             entry.values_begin, entry.values_bytes, entry.copied_step = begin, end - begin, -1
@@ -109,7 +112,7 @@ class DeviceLoop(Reports):
             entry.x_begin, entry.x_bytes = (3 * np.dtype(real).itemsize * k for k in (first, last - first))
         self._real, self._value_bytes = np.dtype(real), int(staged[-1])
         self._targets: dict[int, Float64] = {}
-        self._own_memory: dict[int, Float64] = {}  # by body
+        self._own_memory: dict[int, Float64] = {}  # by its place
         entries = np.ctypeslib.as_array(self._readbacks)
         self._copied_steps, self._requests = entries["copied_step"], entries["requested"]
         loop.driver = c.addressof(device.functions)
@@ -253,14 +256,16 @@ class DeviceLoop(Reports):
         self._request(body, target, structs.REQUEST_POSITIONS)
 
     def copy_memory(self, body: int) -> Float64 | None:
-        """Returns the page-locked memory of the copies of a body's matrix, (blocks, 3, 3); None: of another type."""
-        if self._real != np.float64:
+        """Returns page-locked memory that the next copy of a body's matrix is brought to, (blocks, 3, 3), and that the
+        one behind it leaves alone; None: where matrices are large, or of another type."""
+        if self._real != np.float64 or not self._places:
             return None
-        if body not in self._own_memory:
-            begin = self._readbacks[body].staged_begin
-            memory = self._staging()[begin : begin + self._room[body]]
-            self._own_memory[body] = memory.view(np.float64).reshape(-1, 3, 3)
-        return self._own_memory[body]
+        begin = self._staged_begin[body]
+        place = begin + self._room[body] if self._readbacks[body].staged_begin == begin else begin
+        if place not in self._own_memory:
+            memory = self._staging()[place : place + self._room[body]]
+            self._own_memory[place] = memory.view(np.float64).reshape(-1, 3, 3)
+        return self._own_memory[place]
 
     def _staging(self) -> NDArray[Any]:
         """Returns the page-locked memory of copies, made at the first request."""
@@ -272,8 +277,11 @@ class DeviceLoop(Reports):
 
     def _request(self, body: int, target: Float64, request: int) -> None:
         self._staging()
-        if target is not self._own_memory.get(body):
+        if target is not self.copy_memory(body):
             self._targets[body] = target
+        entry, begin = self._readbacks[body], self._staged_begin[body]
+        if self._places:  # the other one: who has the copy before this one may still read it
+            entry.staged_begin = begin + self._room[body] if entry.staged_begin == begin else begin
         self._copied_steps[body] = -1
         self._requests[body] = request  # last: from then on the loop copies
         self.loop.requested = 1
