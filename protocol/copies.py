@@ -8,11 +8,12 @@ takes longer than to copy a small array.
 import ctypes as c
 from collections.abc import Sequence
 from functools import cache
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import xxhash._xxhash
+import xxhash
 from numpy.typing import NDArray
 
 from protocol.validate import ALONE, all_finite, checksum, copied, helping_threads
@@ -25,7 +26,7 @@ NAMES = ("XXH3_64bits_dispatch", "XXH3_64bits")  # the first one chooses the bes
 @cache
 def _hash() -> int | None:
     """Address of xxh3_64 in the library of the package xxhash; None if it does not offer it to others."""
-    library, sample = c.CDLL(xxhash._xxhash.__file__), bytes(range(256)) * 9
+    library, sample = c.CDLL(import_module("xxhash._xxhash").__file__), bytes(range(256)) * 9
     for name in NAMES:
         try:
             address = c.cast(getattr(library, name), c.c_void_p).value
@@ -45,7 +46,8 @@ class Copies:
     def __init__(self, library: c.CDLL | None):
         self._library = library if _hash() is not None else None
         if self._library is not None:
-            arguments = [c.c_int64, *[c.c_void_p] * 3, c.c_int32, c.c_int32, *[c.c_void_p] * 3, c.c_int32]
+            i, p = c.c_int32, c.c_void_p
+            arguments: list[Any] = [c.c_int64, p, p, p, i, i, p, p, p, i]
             self._library.copy_all.restype, self._library.copy_all.argtypes = None, arguments
 
     def copy(

@@ -348,7 +348,8 @@ def _positive(
         return [bool((each[0][p.diagonal] > 0).all()) for each, p in zip(values, patterns, strict=True)]
     strides = first.nbytes, first.itemsize
     every: NDArray[Any] = np.lib.stride_tricks.as_strided(first, (len(values), count), strides)
-    return list((every[:, patterns[0].diagonal] > 0).all(axis=1).tolist())
+    good: list[bool] = np.all(every[:, patterns[0].diagonal] > 0, axis=1).tolist()
+    return good
 
 
 def _from_payload(message: FactorMessage, payload: Sized) -> Float32 | Float64:
