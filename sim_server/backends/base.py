@@ -132,6 +132,7 @@ class LoopState(Protocol):
     hold: number of a request to stand still between two steps, 0: none; held: the last one that it has followed
     frame_every, energy_every: steps between those that are reported, 0: none
     deadline: of the next step, 0: at once [s]
+    wake: descriptor (eventfd) to which it writes when a matrix that was asked for is there; 0: none
     record_capacity: records that find room
     late_steps, frames_dropped, records_dropped, others_dropped (reactions on what is no obstacle): numbers so far
     """
@@ -147,6 +148,7 @@ class LoopState(Protocol):
     hold: int
     held: int
     deadline: float
+    wake: int
     frame_every: int
     energy_every: int
     record_capacity: int
@@ -259,6 +261,10 @@ class Engine(Protocol):
 
         Returns what waits for P^-1 r, and returns None if it comes to nothing; None: a factor needs no preparation.
         """
+        ...
+
+    def may_prepare(self, body: int) -> bool:
+        """False while a factor of a body before has no step yet, so that another one would have to wait."""
         ...
 
     def drop_factor(self, body: int, factor: Factor) -> None:

@@ -85,6 +85,10 @@ class Dispatch(FactorSource):
         """Factors that are taken in beside the caller, by number of the job."""
         return self._intake.decoding
 
+    def wake_by(self, wake: Callable[[], None]) -> None:
+        """Has `wake` called, in another thread, when a factor that is taken in beside the caller is there."""
+        self._intake.wake = wake
+
     def announce(self, topology: Topology) -> None:
         """Begins a new epoch of an object; answers to jobs of the last one are refused."""
         with self._lock:

@@ -4,7 +4,7 @@
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import zenoh
 
@@ -17,6 +17,8 @@ from protocol.shared_memory.pool import Slot, SlotPool
 from sim_server.network.bookkeeping import Bookkeeping
 from sim_server.network.factor_fetch import AHEAD, FactorFetch
 from sim_server.network.leases import InFlightJob
+
+T = TypeVar("T")
 
 LARGE = 4 << 20  # bytes of a factor whose copy and checks take more than a few milliseconds
 FETCHES = 2  # factors that arrive in parts at a time, each in memory of its own
@@ -58,6 +60,7 @@ class FactorIntake:
         self.factors: list[Factor] = []
         self.decoding: dict[int, Decoding] = {}
         self._fetches: set[int] = set()  # of these, the jobs whose factors come in parts
+        self.wake: Callable[[], None] = lambda: None  # called in another thread when a factor is decoded
 
     def fetched_from(self, worker: str) -> int:
         """Number of factors that are fetched from a worker part by part."""
@@ -87,7 +90,7 @@ class FactorIntake:
         decode = partial(self._book.decoder.decode, message, sample.payload, job)
         if not message.failure and 4 * message.nonzeros > LARGE:  # its bytes are copied and checked beside the caller
             self._refuse_second(job)
-            future = self._thread.submit(decode)
+            future = self._woken(self._thread.submit(decode))
             self.decoding[job.number] = Decoding(job, future, future.result, message.seconds, _slots_used(message))
             return
         self._take_factor(job, decode, message.failure, message.seconds, _slots_used(message))
@@ -113,10 +116,15 @@ class FactorIntake:
             except Refused as refusal:
                 self._counters.refuse(refusal)
         if beside:
-            future = self._thread.submit(self._book.decoder.decode_several, message, list(beside.values()))
+            future = self._woken(self._thread.submit(self._book.decoder.decode_several, message, list(beside.values())))
             for k, (place, job) in enumerate(beside.values()):
                 take, by_slot = partial(_result, future, k), (message.matrix_shared, True)
                 self.decoding[job.number] = Decoding(job, future, take, message.seconds[place], by_slot, duration)
+
+    def _woken(self, future: Future[T]) -> Future[T]:
+        """Has who takes in factors woken at the end of a decoding."""
+        future.add_done_callback(lambda _: self.wake())
+        return future
 
     def _takes_beside(self, message: FactorBatch, place: int, job: InFlightJob, large: bool) -> bool:
         return large and not _failure(message, place) and not self._book.leases.is_reassigned(job)
@@ -149,7 +157,7 @@ class FactorIntake:
             self._slots_for_parts(job),
         )  # fmt: skip
         decode = partial(self._book.decoder.decode, message, b"", job, fetch.run)
-        future, by_slot = self._fetching.submit(decode), _slots_used(message, fetch)
+        future, by_slot = self._woken(self._fetching.submit(decode)), _slots_used(message, fetch)
         self.decoding[job.number] = Decoding(job, future, future.result, message.seconds, by_slot, fetch=fetch)
         self._fetches.add(job.number)
 

@@ -462,8 +462,38 @@ def test_a_large_factor_is_looked_at_and_built_beside_the_caller(parts, monkeypa
     upload.post(0, PATTERN, values, 5)
     upload.settle()
     scene.loop.run(1)
-    assert used(scene) == [5] and maker.planes_used == [2] and len(maker.events) == 1
+    assert used(scene) == [5] and maker.planes_used == [2]
+    assert len(maker.events) == (1 if waits else 2), "it was begun with 11 digits where that had a plan"
     assert threads and threading.current_thread() not in threads
+
+
+@pytest.mark.parametrize("fine", [False, True])
+def test_an_inverse_is_built_while_its_digits_are_found_and_told_of_once_they_are(parts, fine):
+    """With as many digits as the one before; with others it is built again, and only that is told."""
+    scene, maker, upload = parts
+    went, known = threading.Event(), threading.Event()
+    builds = maker.build_many
+    maker.fine = {5} if fine else set()
+
+    def begun(*arguments: Any) -> list[PartitionedInverse]:
+        found = builds(*arguments)
+        went.set()
+        return found
+
+    def planes_for(pattern: SimpleNamespace, values: np.ndarray) -> int:
+        assert known.wait(30)
+        return 2 if values[0] in maker.fine else 1
+
+    maker.build_many, maker.planes_for = begun, planes_for
+    values, applied = prepared(upload, 5)
+    assert went.wait(30) and not applied.done()
+    known.set()
+    np.testing.assert_array_equal(applied.result(30), R / 5)
+    upload.post(0, PATTERN, values, 5)
+    upload.settle()
+    scene.loop.run(1)
+    assert used(scene) == [5] and maker.planes_used == [2 if fine else 1]
+    assert len(maker.events) == (2 if fine else 1)
 
 
 def test_settled_means_used_by_the_next_step_even_if_others_wait(parts):

@@ -798,6 +798,10 @@ class CpuEngine(Reports):
     def prepare_factor(self, body: int, factor: Factor, r: Float64) -> None:
         """Returns None: a factor is applied as it comes."""
 
+    def may_prepare(self, body: int) -> bool:
+        """Returns True: nothing is prepared on a CPU."""
+        return True
+
     def drop_factor(self, body: int, factor: Factor) -> None:
         """Does nothing."""
 

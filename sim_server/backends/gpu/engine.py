@@ -495,6 +495,10 @@ class GpuEngine(DeviceLoop):
 
         return applied
 
+    def may_prepare(self, body: int) -> bool:
+        """False while the factor before waits to be used, or steps under way still read the one that it replaced."""
+        return self._factor_upload.may_prepare(body)
+
     def drop_factor(self, body: int, factor: Factor) -> None:
         """Gives up a factor that may have been prepared, and is not posted."""
         self._factor_upload.drop(body, factor.values)

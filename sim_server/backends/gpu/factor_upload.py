@@ -88,8 +88,7 @@ class GivenFactor:
 
     def tell(self, applied: Applied | None) -> None:
         """Tells who waits for P^-1 r, if it is not told yet."""
-        with suppress(InvalidStateError):
-            self.applied.set_result(applied)
+        _tell(self.applied, applied)
 
 
 class ChosenPlan(NamedTuple):
@@ -97,6 +96,7 @@ class ChosenPlan(NamedTuple):
 
     planes: float16 numbers per entry
     spare: a storage that no step reads; None: one is to be made
+    applied: P^-1 r on its way, if the factor is to be applied
     """
 
     body: int
@@ -104,6 +104,11 @@ class ChosenPlan(NamedTuple):
     planes: int
     plan: Future[PlannedInverse]
     spare: InverseStorage | None
+    applied: "Future[Applied | None]"
+
+    def tell(self, applied: Applied | None) -> None:
+        """Tells who waits for P^-1 r, if it is not told yet."""
+        _tell(self.applied, applied)
 
 
 class Builds(NamedTuple):
@@ -205,6 +210,12 @@ class FactorUpload:
             self._enqueue(body, given)
             self._begin_queued([body], beside=True)
         return given.applied
+
+    def may_prepare(self, body: int) -> bool:
+        """True if the inverse of another factor would be begun at once."""
+        with self._lock:
+            self._refresh(body)
+            return self._uploads[body].free and self._uploads[body].queued is None
 
     def drop(self, body: int, values: NDArray[Any]) -> None:
         """Gives up a factor that was prepared and not posted; any other one is let alone."""
@@ -365,20 +376,26 @@ class FactorUpload:
         return builds
 
     def _chosen(
-        self, body: int, given: GivenFactor, spare: Mapping[InverseKind, InverseStorage | None]
+        self, body: int, given: GivenFactor, spare: Mapping[InverseKind, InverseStorage | None], planes: int = 0
     ) -> ChosenPlan:  # fmt: skip
-        """Chooses how many digits an inverse needs, and begins its plan."""
-        planes = self._solver.planes_for(given.pattern, given.values)
+        """Chooses how many digits an inverse needs, and begins its plan. planes: as many as these; 0: not known yet"""
+        planes = planes or self._solver.planes_for(given.pattern, given.values)
         plan = self._solver.begin_plan(body, given.pattern, planes)
-        return ChosenPlan(body, given, planes, plan, spare.get((given.pattern.id, planes)))
+        return ChosenPlan(body, given, planes, plan, spare.get((given.pattern.id, planes)), given.applied)
 
     def _choose_and_build(
         self, work: Sequence[tuple[int, GivenFactor, Mapping[InverseKind, InverseStorage | None]]],
         made: Future[list[UploadedFactor | Exception]],
     ) -> None:  # fmt: skip
         """Begins to build inverses, in the thread of the plans: now, or behind their plans."""
+        planes = 0
         try:
-            chosen = [self._chosen(*each) for each in work]
+            if len(work) == 1 and self._solver.planes is None:
+                planes, built = self._built_ahead(*work[0])
+                if built is not None:
+                    made.set_result([built])
+                    return
+            chosen = [self._chosen(*each, planes) for each in work]
         except Exception as error:
             for _, given, _ in work:
                 given.tell(None)
@@ -388,6 +405,24 @@ class FactorUpload:
             self._end(chosen, made)
         else:
             self._solver.beside(partial(self._end, chosen, made))
+
+    def _built_ahead(
+        self, body: int, given: GivenFactor, spare: Mapping[InverseKind, InverseStorage | None]
+    ) -> tuple[int, UploadedFactor | Exception | None]:  # fmt: skip
+        """Begins to build an inverse with as many digits as the one before had, and finds out meanwhile how many it
+        needs. Returns the float16 numbers per entry that it needs, and what is made; None: it needs others."""
+        expected = self._uploads[body].planes
+        plan, applied, built = self._solver.begin_plan(body, given.pattern, expected), Future[Applied | None](), None
+        if plan.done():
+            spare_one = spare.get((given.pattern.id, expected))
+            built = self._build([ChosenPlan(body, given, expected, plan, spare_one, applied)])[0]
+        planes = self._solver.planes_for(given.pattern, given.values)
+        if built is not None and planes == expected:
+            given.tell(applied.result())
+            return planes, built
+        if isinstance(built, UploadedFactor):
+            built.inverse.event.synchronize()  # the device writes into memory that nobody keeps
+        return planes, None
 
     def _end(self, chosen: Sequence[ChosenPlan], made: Future[list[UploadedFactor | Exception]]) -> None:
         try:
@@ -409,7 +444,7 @@ class FactorUpload:
                             made[place] = error
         finally:
             for each in chosen:
-                each.given.tell(None)
+                each.tell(None)
         return made
 
     def _build_by(
@@ -444,7 +479,7 @@ class FactorUpload:
         if chosen.given.r is None or chosen.given.dropped:  # dropped: nobody would keep the memory that it comes to
             return
         try:
-            chosen.given.tell(builder.apply(inverse, chosen.given.r, self._multiprocessors))
+            chosen.tell(builder.apply(inverse, chosen.given.r, self._multiprocessors))
         except Exception as error:
             log.warning("object %r: a factor is not applied for its check: %s", self._uploads[chosen.body].name, error)
 
@@ -532,3 +567,8 @@ class FactorUpload:
             log.warning(
                 "object %r: a factor cannot be used on the GPU: %s; it goes on with %s", uploads.name, reason, held
             )
+
+
+def _tell(waiting: "Future[Applied | None]", applied: Applied | None) -> None:
+    with suppress(InvalidStateError):
+        waiting.set_result(applied)
