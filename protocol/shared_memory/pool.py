@@ -209,12 +209,12 @@ class SlotPool:
         """Returns the smallest capacity of a free slot that fits."""
         return min((c for c, slots in self._free.items() if slots and _fits(size, c)), default=None)
 
-    def give_back(self, slot: Slot) -> None:
-        """Takes a slot back from one of its users; a slot that is not lent is ignored."""
-        users = self._lent.pop(id(slot), 0)
-        if users > 1:
-            self._lent[id(slot)] = users - 1
-        elif users == 1:
+    def give_back(self, slot: Slot, users: int = 1) -> None:
+        """Takes a slot back from one of its users, or from several; a slot that is not lent is ignored."""
+        lent = self._lent.pop(id(slot), 0)
+        if lent > users:
+            self._lent[id(slot)] = lent - users
+        elif lent:
             self._put_back(slot)
 
     def _put_back(self, slot: Slot) -> None:

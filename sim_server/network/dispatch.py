@@ -20,7 +20,7 @@ from protocol.shared_memory.pool import SlotPool
 from protocol.validate import take
 from sim_server.network.bookkeeping import Bookkeeping
 from sim_server.network.factor_decoder import FactorDecoder
-from sim_server.network.factor_intake import Decoding, FactorIntake
+from sim_server.network.factor_intake import FactorIntake
 from sim_server.network.inbox import Inbox
 from sim_server.network.job_sender import JobSender
 from sim_server.network.leases import InFlightJob, Leases
@@ -81,9 +81,9 @@ class Dispatch(FactorSource):
         }
 
     @property
-    def decoding(self) -> dict[int, Decoding]:
-        """Factors that are taken in beside the caller, by number of the job."""
-        return self._intake.decoding
+    def decoding(self) -> int:
+        """Number of factors that are taken in beside the caller. A probe for tests."""
+        return self._intake.decoded
 
     def wake_by(self, wake: Callable[[], None]) -> None:
         """Has `wake` called, in another thread, when a factor that is taken in beside the caller is there."""

@@ -21,7 +21,7 @@ from sim_server.backends.gpu.followed_rows import FollowedRows
 from sim_server.backends.gpu.inverse.build_inverse import InverseBuilder, PartitionedInverse, builder_kernels
 from sim_server.backends.gpu.inverse.device_plan import DevicePlan, shared_bytes
 from sim_server.backends.gpu.inverse.digits import library as digits_library
-from sim_server.backends.gpu.inverse.digits import planes_for
+from sim_server.backends.gpu.inverse.digits import planes_of
 from sim_server.backends.gpu.inverse.plan import plan
 from sim_server.backends.gpu.row_partition import SPARED, best_assignment, halo, initial_ranges, lists_of
 from sim_server.backends.gpu.structs import CONTACT, CORRECTION, PCG, PCG_RESULT, STAGES
@@ -266,9 +266,9 @@ class PcgSolver:
         """Has the kernels that build inverses compiled beside the caller, before a factor waits for them."""
         self.beside(lambda: builder_kernels(self.gpu))
 
-    def planes_for(self, pattern: FactorPattern, values: NDArray[Any]) -> int:
-        """Returns the float16 numbers per entry that the inverse of a factor gets. From any thread."""
-        return planes_for(pattern, values) if self.planes is None else self.planes
+    def planes_of(self, factors: Sequence[tuple[FactorPattern, NDArray[Any]]]) -> list[int]:
+        """Returns the float16 numbers per entry that the inverse of each of some factors gets. From any thread."""
+        return planes_of(factors) if self.planes is None else [self.planes] * len(factors)
 
     def beside(self, work: Callable[[], T]) -> Future[T]:
         """Has work done in the thread of the plans, one after another."""

@@ -132,15 +132,14 @@ class Async(UpdatePolicy):
         """Sends copies to idle workers in the order of the requests. With a prefetch depth others wait their turn."""
         driver = self.driver
         copied = driver.snapshots.completed()
-        if copied and copied[-1].job.request > self._newest_copy:
-            self._newest_copy = copied[-1].job.request
-            self.prefetch.on_copy(time.monotonic() - copied[-1].job.requested)
-        idle = driver.source.ready() if copied else 0
+        if copied and (newest := copied[-1][0].job).request > self._newest_copy:
+            self._newest_copy = newest.request
+            self.prefetch.on_copy(time.monotonic() - newest.requested)
+        idle, now = driver.source.ready() if copied else 0, driver.engine.step
         made: list[tuple[BodyUpdateState, Job]] = []
-        for state in copied:
-            waited = driver.engine.step - driver.snapshots.step(state)
+        for state, step in copied:
             if idle <= len(made) and self.prefetch.depth:
-                if waited > self.prefetch.patience:
+                if now - step > self.prefetch.patience:
                     driver.snapshots.discard(state)
                 continue
             if (job := driver.make_job(state)) is not None:
