@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sim_server.arrays import Float64
-from sim_server.updates.body_state import BodyUpdateState
+from sim_server.updates.body_state import BodyUpdateState, on_sent
 from sim_server.updates.factor_source import Job
 from sim_server.updates.policies.base import UpdatePolicy
 from sim_server.updates.prefetch import PrefetchDepth
@@ -147,11 +147,15 @@ class Async(UpdatePolicy):
         self.prefetch.on_sent(len(made), time.monotonic())
         if not made:
             return
+        sent: list[tuple[int, int]] = []
         for (state, job), taken in zip(made, driver.source.submit_many([job for _, job in made]), strict=True):
             if taken:
-                state.on_sent(job.step)
+                state.job.on_sent(job.step)
+                sent.append((state.body.index, job.step))
             else:
                 driver.snapshots.discard(state)
+        if sent:
+            on_sent(driver.table, *zip(*sent, strict=True))
 
     def _overdue(self, workers: int) -> float:
         """Returns the steps after which a body goes next whatever the rule; inf without workers."""
