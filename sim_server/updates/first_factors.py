@@ -108,8 +108,8 @@ class FirstFactors:
 
 
 def _lasting(job: Job) -> Job:
-    """Returns the job with a copy of its values if it may share a message: these are read when the message leaves, which
-    may be after the step has gone on without its factor, and then the next step makes them anew."""
+    """Returns the job with a copy of its values if it may share a message: they are read when that leaves, which may be
+    after this step has gone on without its factor, and the next step makes them anew."""
     return replace(job, values=job.values.copy()) if job.values.nbytes <= SMALL else job
 
 

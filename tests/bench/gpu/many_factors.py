@@ -21,9 +21,9 @@ PATIENCE = 120.0  # s for the first factor
 
 
 def measure(beams: int, tets: int, device: str, worker: str, first: float, seconds: float) -> Row:
-    """Measures for `seconds`, from when all beams use their second factor: some of the first ones are old, as they waited
-    for the others. Begins `first` seconds at most after a first factor came, for which a worker on a GPU may compile
-    its kernels, as the server does those that build inverses."""
+    """Measures for `seconds`, from when all beams use their second factor: some of the first ones are old, as they
+    waited for the others. Begins `first` seconds at most after a first factor came, for which a worker on a GPU may
+    compile its kernels, as the server does those that build inverses."""
     with tempfile.TemporaryDirectory() as folder:
         sim = Simulation.load(Problem(tets, beams=beams).write(Path(folder)), device=device)
     with Served(sim, worker) as served:
