@@ -3,6 +3,7 @@
 
 import logging
 import time
+from collections import deque
 from collections.abc import Callable, Sequence
 from itertools import groupby
 from typing import Any, NamedTuple
@@ -19,10 +20,11 @@ from precond_worker.factorization.registry import Factorization
 from precond_worker.job import Job, accept
 from precond_worker.network.presence import ServerGone, ServersThere
 from precond_worker.network.server_connection import ServerConnection
+from precond_worker.preparation import LEAST_NODES, objects_to_prepare
 from precond_worker.remote_assembly import Assemblers
 from protocol.channels import WHOLE_PARTS
 from protocol.factor import FactorPattern
-from protocol.messages_pb2 import Factor
+from protocol.messages_pb2 import Factor, Topology
 from protocol.method import COMPLETE, Method
 from protocol.process.exhausted import exhausted
 from protocol.refused import Refused
@@ -56,7 +58,7 @@ class JobsTogether(NamedTuple):
 class Worker:
     """Does the jobs of one server: the object that waits longest first, of each the newest matrix; together with it
     those of other objects, where a library factorizes many matrices of one pattern at a time. While it does, the next
-    ones are made ready, and the last ones sent."""
+    ones are made ready, and the last ones sent. Before there is a job the symbolic phase of large objects is done."""
 
     def __init__(
         self, connection: ServerConnection, analyse: Analyse, on_server: Callable[[bool], None] = lambda found: None,
@@ -73,6 +75,7 @@ class Worker:
         self._assemblers = Assemblers(connection)
         self._pending: dict[str, Job] = {}
         self._under_way: JobsTogether | None = None
+        self._unprepared: deque[str | None] = deque()  # objects to be made ready for; None: the scene tells which
         self._last_end = 0.0  # when such jobs were done last [s]
         self._answers: dict[int, BatchAnswer] = {}  # by id of the batch; sent before a batch is forgotten
 
@@ -93,19 +96,47 @@ class Worker:
 
     @property
     def waiting(self) -> int:
-        """Number of jobs taken in and not done."""
-        return len(self._pending) + (0 if self._under_way is None else len(self._under_way.jobs))
+        """Number of jobs taken in and not done; 1 while there is something to prepare."""
+        jobs = len(self._pending) + (0 if self._under_way is None else len(self._under_way.jobs))
+        return jobs or min(len(self._unprepared), 1)
 
     def work(self) -> bool:
         """Does one job, or several of one pattern together; returns False if there is none."""
         if not self.waiting:
             return False
+        if self._unprepared and not self._pending and self._under_way is None:
+            self._prepare(self._unprepared.popleft())
+            self._done()
+            if not self._unprepared:
+                self._connection.tell()  # the server may wait for that
+            return True
         try:
             self._work()
         finally:
             self._send_answers()
         self._done()
         return True
+
+    def _prepare(self, object: str | None) -> None:
+        """Does the symbolic phase of an object, unless it is small; None: finds out of which it is to be done."""
+        connection, method = self._connection, Method()
+        try:
+            if object is None:
+                self._unprepared.extend(objects_to_prepare(connection.scene()))
+                return
+            topology = connection.topology(object)
+            if topology.nodes < LEAST_NODES:
+                return
+            analysis = self._analysis_of(object, topology, method)
+            connection.send_pattern(analysis.pattern, object, topology.header.epoch)
+            if (make_ready := getattr(analysis, "make_ready", None)) is not None:
+                make_ready()
+        except DeviceUnusable:
+            raise
+        except Exception as error:  # the first job will tell of it, if it is still so then
+            if exhausted(error) and not isinstance(error, MemoryError):
+                raise
+            log.debug("nothing is prepared: %s", error)
 
     def finish(self) -> None:
         """Waits for the jobs that are under way, and answers them."""
@@ -271,9 +302,11 @@ class Worker:
                 self._forget()
                 self._connection.follow(incarnation)
                 self._on_server(True)
+                self._unprepared.append(None)
                 return
 
     def _forget(self) -> None:
+        self._unprepared.clear()
         self._counters.add("superseded", self.waiting)
         self._pending.clear()
         under_way, self._under_way = self._under_way, None
@@ -352,17 +385,21 @@ class Worker:
         """Returns the symbolic phase, done once per epoch of an object."""
         object, epoch, blocks = job.object, job.epoch, job.blocks
         if self._known_analysis(job) is None:
-            topology = self._connection.topology(object, epoch)
-            row_start = array(topology.row_start, np.int32, (topology.nodes + 1,), "Topology.row_start")
-            columns = array(topology.columns, np.int32, (-1,), "Topology.columns")
-            analysis = self._shared(topology_checksum(topology), row_start, columns, job.method)
-            self._analyses[object, job.method.name] = CachedAnalysis(epoch, job.method, len(columns), analysis)
-            if job.method.name == COMPLETE:  # by one of several libraries
-                self._connection.library = analysis.library
+            self._analysis_of(object, self._connection.topology(object, epoch), job.method)
         known = self._analyses[object, job.method.name]
         if known.blocks != blocks:
             raise Refused(f"Matrix.blocks is {blocks}; allowed: {known.blocks}, as in the topology", "shape")
         return known.factorization
+
+    def _analysis_of(self, object: str, topology: Topology, method: Method) -> Factorization:
+        """Does the symbolic phase of an object, unless one like it has had it."""
+        row_start = array(topology.row_start, np.int32, (topology.nodes + 1,), "Topology.row_start")
+        columns = array(topology.columns, np.int32, (-1,), "Topology.columns")
+        analysis = self._shared(topology_checksum(topology), row_start, columns, method)
+        self._analyses[object, method.name] = CachedAnalysis(topology.header.epoch, method, len(columns), analysis)
+        if method.name == COMPLETE:  # by one of several libraries
+            self._connection.library = analysis.library
+        return analysis
 
     def _shared(self, topology: int, row_start: Int32, columns: Int32, method: Method) -> Factorization:
         """Returns the symbolic phase of a pattern; objects of one topology (its checksum) share that of complete

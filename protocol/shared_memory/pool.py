@@ -187,6 +187,11 @@ class SlotPool:
         """True if a slot for so many bytes is being made in a thread."""
         return any(_fits(size, capacity) for capacity in self._making.values())
 
+    @property
+    def makes_any(self) -> bool:
+        """True if a slot is being made in a thread."""
+        return not all(making.done() for making in self._making)
+
     def _take_made(self) -> None:
         """Adds the slots that the thread has made to those that are free."""
         for future in [each for each in self._making if each.done()]:

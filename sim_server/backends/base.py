@@ -280,6 +280,10 @@ class Engine(Protocol):
         """Prepares for factors of a pattern that will come, without waiting."""
         ...
 
+    def expects_factors(self) -> bool:
+        """True once it is prepared for all factors that will come."""
+        ...
+
     def resume_factor(self, body: int, pattern: FactorPattern, values: NDArray[Any], step: int) -> None:
         """As `post_factor`, of the factor that was in use when the state that was written was saved."""
         ...

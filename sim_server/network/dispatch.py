@@ -89,6 +89,11 @@ class Dispatch(FactorSource):
         """Has `wake` called, in another thread, when a factor that is taken in beside the caller is there."""
         self._intake.wake = wake
 
+    def makes_slots(self) -> bool:
+        """True while shared memory for arrays is being made beside the caller."""
+        with self._lock:
+            return self._pool is not None and self._pool.makes_any
+
     def announce(self, topology: Topology) -> None:
         """Begins a new epoch of an object; answers to jobs of the last one are refused."""
         with self._lock:
@@ -277,3 +282,4 @@ class Dispatch(FactorSource):
     def _on_pattern(self, sample: zenoh.Sample) -> None:
         if (new := self.decoder.add_pattern(sample.key_expr, sample.payload)) is not None:
             self._patterns = [*self._patterns, new][-MAX_NEW_PATTERNS:]
+            self._sender.prepare_for(new[1])

@@ -83,8 +83,12 @@ class AnnouncedObject:
         return list(dict.fromkeys((*self.patterns, *self.complete.patterns)))
 
     def most_values(self, method: str) -> int:
-        """Number of values of the largest factor by a method so far, also of objects like it; 0: there was none."""
-        return max(self.largest.get(method, 0), self.complete.largest if method == COMPLETE else 0)
+        """Number of values of the largest factor by a method so far, also of objects like it; 0: not known. What is not
+        known of complete ones their pattern tells."""
+        if method != COMPLETE:
+            return self.largest.get(method, 0)
+        known = max(self.largest.get(method, 0), self.complete.largest)
+        return known or max((pattern.nonzeros for pattern in self.patterns.values()), default=0)
 
 
 class FactorDecoder:

@@ -218,13 +218,17 @@ class Driver:
         """Passes on the factors that a source has made since the last call, and takes note of failed jobs and of
         patterns that factors will have."""
         self._end_checks()
-        for name, pattern in source.patterns():
-            self.engine.expect_factors(self.by_name[name].body.index, pattern)
+        self.expect_factors(source)
         behind, self._behind = self._behind, []
         if factors := [*behind, *source.poll()]:
             on_factors(factors)
         for name, reason in source.failures():
             self.fail(name, reason)
+
+    def expect_factors(self, source: FactorSource) -> None:
+        """Has the loop prepare for the factors whose patterns have come."""
+        for name, pattern in source.patterns():
+            self.engine.expect_factors(self.by_name[name].body.index, pattern)
 
     def adopt(self, factors: Sequence[Factor], now: bool = False) -> None:
         """Puts factors into the mailboxes of their bodies, unless a newer one is there or the check refuses it.

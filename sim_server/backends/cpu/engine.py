@@ -812,6 +812,10 @@ class CpuEngine(Reports):
     def expect_factors(self, body: int, pattern: FactorPattern) -> None:
         """Does nothing: a factor is applied as it comes."""
 
+    def expects_factors(self) -> bool:
+        """Returns True."""
+        return True
+
     def resume_factor(self, body: int, pattern: FactorPattern, values: NDArray[Any], step: int) -> None:
         """Posts the factor that was in use when the state was saved; what is known of its correction holds."""
         self.post_factor(body, pattern, values, step)

@@ -294,6 +294,12 @@ class PcgSolver:
         made.add_done_callback(partial(self._forget_failed, key))
         return made
 
+    @property
+    def plans_made(self) -> bool:
+        """True if no plan is being made."""
+        with self._lock:
+            return all(made.done() for made in self._plans.values())
+
     def _forget_failed(self, key: tuple[int, int, int], made: Future[PlannedInverse]) -> None:
         """Has a plan that could not be made tried again the next time: memory may be free then."""
         if made.exception() is not None:
