@@ -32,9 +32,9 @@ class SlotAllocator(Protocol):
         """Frees a slot that so many jobs used."""
 
 
-@dataclass(frozen=True)
+@dataclass(eq=False, slots=True)
 class InFlightJob:
-    """A job sent to one worker. Times are monotonic [s].
+    """A job sent to one worker, which does not change. Times are monotonic [s].
 
     number: of the job, unique in the life of the server
     sent_at, deadline: begin and end of its lease
@@ -116,11 +116,16 @@ class Leases:
 
     def start(self, job: InFlightJob) -> None:
         """Adds a job that is being sent."""
-        self.by_object[job.object] = job
-        self.by_worker.setdefault(job.worker, {})[job.number] = job
-        self._next_deadline = min(self._next_deadline, job.deadline)
+        self.start_all([job])
+
+    def start_all(self, jobs: Sequence[InFlightJob]) -> None:
+        """Adds jobs that are being sent to one worker."""
+        worker, deadlines = jobs[0].worker, [job.deadline for job in jobs]
+        self.by_object.update((job.object, job) for job in jobs)
+        self.by_worker.setdefault(worker, {}).update((job.number, job) for job in jobs)
+        self._next_deadline = min(self._next_deadline, *deadlines)
         if self._deadlines is not None:
-            self._deadlines[job.worker] = max(self._deadlines.get(job.worker, job.deadline), job.deadline)
+            self._deadlines[worker] = max(self._deadlines.get(worker, deadlines[0]), *deadlines)
 
     def cancel(self, job: InFlightJob) -> None:
         """Removes a job that was never sent."""
@@ -239,7 +244,7 @@ class Leases:
 
         lost = []
         for worker, jobs in self.by_worker.items():
-            if (period := idle(worker)) is not None:
+            if (period := idle(worker)) is not None and period[1] - period[0] > DELIVERY:
                 since = [(job, period[1] - max(period[0], sent_at(job))) for job in jobs.values()]
                 lost += [job for job, seconds in since if seconds > self.delivery_time(job)]
         return self._expire(lost)

@@ -78,7 +78,7 @@ class GivenFactor:
     values: NDArray[Any]
     step: int
     r: Float64 | None = None
-    applied: "Future[Applied | None]" = field(default_factory=Future)
+    applied: "Future[Applied | None] | None" = None
     wanted: bool = True
     dropped: bool = False
 
@@ -109,7 +109,7 @@ class ChosenPlan(NamedTuple):
     planes: int
     plan: Future[PlannedInverse]
     spare: InverseStorage | None
-    applied: "Future[Applied | None]"
+    applied: "Future[Applied | None] | None"
 
     def tell(self, applied: Applied | None) -> None:
         """Tells who waits for P^-1 r, if it is not told yet."""
@@ -211,12 +211,13 @@ class FactorUpload:
     ) -> "Future[Applied | None]":  # fmt: skip
         """Builds the inverse of a factor, beside the caller, and applies it to r (n,); it is used once these very
         values are posted. Returns P^-1 r; None as its result if it comes to nothing."""
-        given = GivenFactor(pattern, values, step, r, wanted=False)
+        applied: Future[Applied | None] = Future()
+        given = GivenFactor(pattern, values, step, r, applied, wanted=False)
         with self._lock:
             self._refresh(body)
             self._enqueue(body, given)
             self._begin_queued([body], beside=True)
-        return given.applied
+        return applied
 
     def may_prepare(self, body: int) -> bool:
         """True if the inverse of another factor would be begun at once."""
@@ -587,6 +588,7 @@ class FactorUpload:
             )
 
 
-def _tell(waiting: "Future[Applied | None]", applied: Applied | None) -> None:
-    with suppress(InvalidStateError):
-        waiting.set_result(applied)
+def _tell(waiting: "Future[Applied | None] | None", applied: Applied | None) -> None:
+    if waiting is not None:
+        with suppress(InvalidStateError):
+            waiting.set_result(applied)

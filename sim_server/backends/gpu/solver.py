@@ -156,6 +156,7 @@ class PcgSolver:
         self._lock = threading.Lock()
         self._plans: dict[tuple[int, int, int], Future[PlannedInverse]] = {}  # by pattern, planes, thread blocks
         self._vectors: dict[tuple[int, int], dict[str, DeviceArray]] = {}  # by body and plan
+        self._plan_in_row: dict[int, DevicePlan] = {}  # by body
         self._factor_bytes = [0] * len(ranges)
 
     @property
@@ -334,8 +335,11 @@ class PcgSolver:
     def use(self, body: int, pattern: FactorPattern, inverse: PartitionedInverse, planes: int, step: int) -> None:
         """Writes a factor into the host row of a body; it is in use once the row is uploaded."""
         device_plan, row = self.plan(body, pattern, planes), self.bodies[body]
-        row["plan"], row["matrix"], row["scale"] = device_plan.address, inverse.matrix, inverse.scale
-        row["planes"], row["factor_step"] = planes, step
+        row["matrix"], row["scale"], row["factor_step"] = inverse.matrix, inverse.scale, step
+        if self._plan_in_row.get(body) is device_plan:
+            return
+        self._plan_in_row[body] = device_plan
+        row["plan"], row["planes"] = device_plan.address, planes
         self.reserve_vectors(body, device_plan)
         for name, array in self._vectors[body, device_plan.address].items():
             row[name] = array.data.ptr
