@@ -203,11 +203,12 @@ class Driver:
 
     def _job(self, state: BodyUpdateState, step: int, values: NDArray[np.float64]) -> Job:
         name, epoch = state.body.name, self.simulation.epoch(state.body.name, step)
-        if self.simulation.splits is not None and values.ndim == 3:  # the copy has room for more blocks
-            values = values[: len(self._patterns.at(name, epoch)[1])]
-        if self.source.epoch(name) not in (None, epoch):
-            for begin in self.on_epoch:
-                begin(state.body, epoch)
+        if self.simulation.splits is not None:
+            if values.ndim == 3:  # the copy has room for more blocks
+                values = values[: len(self._patterns.at(name, epoch)[1])]
+            if self.source.epoch(name) not in (None, epoch):
+                for begin in self.on_epoch:
+                    begin(state.body, epoch)
         method = self.solver.method if state.tuner is None else state.tuner.factorization.method
         state.on_job(step, method)
         return Job(name, epoch, step, self._warped[name], values, self.solver.factor_dtype, method)
@@ -297,7 +298,7 @@ class Driver:
                     self.snapshots.recycle(memory)
             good, reasons = [], []
             for factor, reason in zip(check.factors, check.reasons.result(), strict=True):
-                if self.source.epoch(factor.object) not in (None, factor.epoch):
+                if self.simulation.splits and self.source.epoch(factor.object) not in (None, factor.epoch):
                     self.engine.drop_factor(self.by_name[factor.object].body.index, factor)
                     self.fail(factor.object, "it was of a mesh that was split since", step=factor.step)
                     continue
