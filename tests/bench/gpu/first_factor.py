@@ -37,10 +37,10 @@ def measure(
 ) -> Row:  # fmt: skip
     """Runs a server for some seconds after its first answer, in real time; at least half of them with a factor.
 
-    first: solver.first_factor. Returns: seconds from the start of the process to that answer; files that were new in the
-    caches; steps and seconds until a step used a factor; of the status queries the number,
-    how many failed, and the longest [ms]; of the factors in the last half their number a second, mean age [steps] and
-    time from the step of the matrix to the first step that uses it [ms]; times of the steps in that half [ms]
+    first: solver.first_factor. Returns: files that were new in the caches; seconds from the start of the process to the
+    first answer; steps and seconds until a step used a factor; of the status queries the number, how many failed, and
+    the longest [ms]; of the factors in the last half their number a second, mean age [steps] and time from the step of
+    the matrix to the first step that uses it [ms]; times of the steps in that half [ms]
     """
     with tempfile.TemporaryDirectory() as folder:
         scene = Problem(tets, dt=dt).write(Path(folder))
@@ -96,7 +96,8 @@ def _watched(endpoint: str, seconds: float, dt: float, started: float) -> Row:
             time.sleep(0.005)
         milliseconds = 1e3 * np.array(waits)
         return {
-            "answers after s": begun - started, "in use s": used, "in use step": step_of_use, "queries": len(waits), "failed": failed,
+            "answers after s": begun - started,
+            "in use s": used, "in use step": step_of_use, "queries": len(waits), "failed": failed,
             "answer ms p50": float(np.percentile(milliseconds, 50)), "answer ms max": float(milliseconds.max()),
             **_of_steps(steps, dt), "late steps": int(status.late_steps),
         }  # fmt: skip
