@@ -298,7 +298,7 @@ class Driver:
                     self.snapshots.recycle(memory)
             good, reasons = [], []
             for factor, reason in zip(check.factors, check.reasons.result(), strict=True):
-                if self.simulation.splits and self.source.epoch(factor.object) not in (None, factor.epoch):
+                if self.source.epoch(factor.object) not in (None, factor.epoch):
                     self.engine.drop_factor(self.by_name[factor.object].body.index, factor)
                     self.fail(factor.object, "it was of a mesh that was split since", step=factor.step)
                     continue
