@@ -171,7 +171,9 @@ class Worker:
         """Takes the job that waits longest, and others that can be factorized together with it."""
         first = self._pending.pop(next(iter(self._pending)))
         shared = self._known_analysis(first)
-        most = getattr(shared, "most", 1) if self._pending else 1
+        most: int = getattr(shared, "most", 1)
+        if shared is not None:
+            self._connection.together = most
         jobs = [first]
         for name, job in list(self._pending.items()):
             if len(jobs) >= most:

@@ -24,6 +24,7 @@ from sim_server.network.factor_intake import FactorIntake
 from sim_server.network.inbox import Inbox
 from sim_server.network.job_sender import JobSender
 from sim_server.network.leases import InFlightJob, Leases
+from sim_server.network.native_copies import compile_ahead
 from sim_server.network.send_queue import SendQueue
 from sim_server.network.worker_choice import WorkerChoice
 from sim_server.network.worker_registry import WorkerRegistry
@@ -58,6 +59,7 @@ class Dispatch(FactorSource):
         silence: float,
         clock: Callable[[], float],
     ):
+        compile_ahead()
         self._counters, self._pool, self._shared, self._clock = counters, pool, pool is not None, clock
         self.decoder, self.leases, self.reliability = FactorDecoder(incarnation), Leases(pool), WorkerReliability()
         self._registry = WorkerRegistry(incarnation, silence)

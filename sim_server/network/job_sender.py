@@ -231,9 +231,9 @@ class JobSender:
         return self._pool is not None and size <= max(WHOLE_PARTS * PART_BYTES, self._pool.limit // SLOT_SHARE)
 
     def prepare_for(self, pattern: FactorPattern) -> None:
-        """Has the slot for a large factor made beside the caller, before its first job."""
-        if self._pool is not None and self._fits_slot(size := 4 * pattern.nonzeros):
-            self._pool.prepare(size)
+        """Has the slot for a large factor, or for its parts, made beside the caller before its first job."""
+        if self._pool is not None:
+            self._pool.prepare(size if self._fits_slot(size := 4 * pattern.nonzeros) else PART_BYTES)
 
     # ---- both ------------------------------------------------------------------------------------------------
 

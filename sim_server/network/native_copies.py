@@ -5,7 +5,12 @@ import ctypes
 from functools import cache
 
 from protocol.copies import SOURCE, Copies
-from sim_server.backends.compiler import build
+from sim_server.backends.compiler import begin, build
+
+
+def compile_ahead() -> None:
+    """Begins to compile, so that the first copies do not wait for it. Raises CompileError."""
+    begin(SOURCE)
 
 
 @cache
