@@ -157,6 +157,7 @@ def _serve(
     from protocol.network.identity import usual_identity
     from protocol.network.metrics_server import MetricsServer, metrics_address
     from protocol.network.session import Session
+    from protocol.process.long_lived import keep_long_lived
     from protocol.process.notify import Notifier
     from protocol.refused import Refused
 
@@ -217,6 +218,7 @@ def _serve(
     with closing, MainLoop(
         where, shared_memory, connection, worker, identity, name, left, notifier.alive
     ) as serving:  # fmt: skip
+        keep_long_lived()
         notifier.ready(f"{shown}, looking for {', '.join(servers)}")
         try:
             serving.run()

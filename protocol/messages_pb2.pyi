@@ -326,7 +326,7 @@ class FactorBatch(_message.Message):
     def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., worker: _Optional[str] = ..., jobs: _Optional[_Iterable[int]] = ..., patterns: _Optional[_Iterable[int]] = ..., nonzeros: _Optional[_Iterable[int]] = ..., checksums: _Optional[_Iterable[int]] = ..., seconds: _Optional[_Iterable[float]] = ..., failures: _Optional[_Iterable[str]] = ..., remedies: _Optional[_Iterable[str]] = ..., slot: _Optional[_Union[Slot, _Mapping]] = ..., matrix_shared: _Optional[bool] = ...) -> None: ...
 
 class WorkerInfo(_message.Message):
-    __slots__ = ("header", "worker", "pid", "host", "library", "threads", "shared_memory", "jobs", "failures", "superseded", "refused", "bulk_shared", "bulk_copied", "builds", "idle", "share", "leaving", "most_jobs", "batches")
+    __slots__ = ("header", "worker", "pid", "host", "library", "threads", "shared_memory", "jobs", "failures", "superseded", "refused", "bulk_shared", "bulk_copied", "builds", "idle", "share", "leaving", "most_jobs", "batches", "together")
     HEADER_FIELD_NUMBER: _ClassVar[int]
     WORKER_FIELD_NUMBER: _ClassVar[int]
     PID_FIELD_NUMBER: _ClassVar[int]
@@ -346,6 +346,7 @@ class WorkerInfo(_message.Message):
     LEAVING_FIELD_NUMBER: _ClassVar[int]
     MOST_JOBS_FIELD_NUMBER: _ClassVar[int]
     BATCHES_FIELD_NUMBER: _ClassVar[int]
+    TOGETHER_FIELD_NUMBER: _ClassVar[int]
     header: Header
     worker: str
     pid: int
@@ -365,7 +366,8 @@ class WorkerInfo(_message.Message):
     leaving: bool
     most_jobs: int
     batches: bool
-    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., worker: _Optional[str] = ..., pid: _Optional[int] = ..., host: _Optional[str] = ..., library: _Optional[str] = ..., threads: _Optional[int] = ..., shared_memory: _Optional[bool] = ..., jobs: _Optional[int] = ..., failures: _Optional[int] = ..., superseded: _Optional[int] = ..., refused: _Optional[int] = ..., bulk_shared: _Optional[int] = ..., bulk_copied: _Optional[int] = ..., builds: _Optional[bool] = ..., idle: _Optional[bool] = ..., share: _Optional[float] = ..., leaving: _Optional[bool] = ..., most_jobs: _Optional[int] = ..., batches: _Optional[bool] = ...) -> None: ...
+    together: int
+    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., worker: _Optional[str] = ..., pid: _Optional[int] = ..., host: _Optional[str] = ..., library: _Optional[str] = ..., threads: _Optional[int] = ..., shared_memory: _Optional[bool] = ..., jobs: _Optional[int] = ..., failures: _Optional[int] = ..., superseded: _Optional[int] = ..., refused: _Optional[int] = ..., bulk_shared: _Optional[int] = ..., bulk_copied: _Optional[int] = ..., builds: _Optional[bool] = ..., idle: _Optional[bool] = ..., share: _Optional[float] = ..., leaving: _Optional[bool] = ..., most_jobs: _Optional[int] = ..., batches: _Optional[bool] = ..., together: _Optional[int] = ...) -> None: ...
 
 class Need(_message.Message):
     __slots__ = ("header", "lost", "workers")

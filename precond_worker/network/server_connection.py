@@ -52,6 +52,7 @@ class ServerConnection:
         self.incarnation = 0  # of the server that is served; 0: none
         self.shared_memory = False
         self.share = 1.0  # part of this process's time for the server
+        self._together = 0
         self.leaving: float | None = None  # since when it takes no more jobs [s, monotonic]
         self._session, self._threads, self._can_assemble = session, threads, can_assemble()
         self._sequence: Counter[str] = Counter()
@@ -155,6 +156,7 @@ class ServerConnection:
                 leaving=self.leaving is not None,
                 most_jobs=MOST_JOBS,
                 batches=True,
+                together=self._together,
             )
             self._session.zenoh.put(key("worker", self.server, worker=self.name), info.SerializeToString())
 
@@ -169,8 +171,13 @@ class ServerConnection:
             sequence=self._sequence[channel + object],
         )
 
-    def topology(self, object: str, epoch: int) -> Topology:
-        """Queries the topology of an object; raises Refused if the server does not have that of this epoch."""
+    def tell(self) -> None:
+        """Says hello at once, as what it tells has changed."""
+        self._heartbeat.wake()
+
+    def topology(self, object: str, epoch: int | None = None) -> Topology:
+        """Queries the topology of an object; raises Refused if the server does not have that of this epoch. None: the
+        present one"""
         for reply in self._session.zenoh.get(key("topology", self.server, object=object), timeout=TIMEOUT):
             if reply.ok is None:
                 break
@@ -204,6 +211,17 @@ class ServerConnection:
         """Sends answers to jobs of one batch; the values of the factors are in its slot."""
         name = key("factors", self.server, worker=self.name)
         self._session.zenoh.put(name, b"", attachment=message.SerializeToString(), congestion_control=BLOCK)
+
+    @property
+    def together(self) -> int:
+        """Number of matrices of one pattern that are factorized together."""
+        return self._together
+
+    @together.setter
+    def together(self, together: int) -> None:
+        if together != self._together:
+            self._together = together
+            self._heartbeat.wake()
 
     def leave(self) -> None:
         """Has the server send no more jobs; one under way may still be answered."""

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from protocol.factor import Factor, FactorPattern
-from sim_server.arrays import Float64, Int32
+from sim_server.arrays import Float64, Int32, Int64
 from sim_server.backends.state import StateArray
 
 if TYPE_CHECKING:
@@ -280,6 +280,10 @@ class Engine(Protocol):
         """Prepares for factors of a pattern that will come, without waiting."""
         ...
 
+    def expects_factors(self) -> bool:
+        """True once it is prepared for all factors that will come."""
+        ...
+
     def resume_factor(self, body: int, pattern: FactorPattern, values: NDArray[Any], step: int) -> None:
         """As `post_factor`, of the factor that was in use when the state that was written was saved."""
         ...
@@ -316,6 +320,11 @@ class Engine(Protocol):
         """Has the values of the next matrix of the body copied into `target` (blocks, 3, 3)."""
         ...
 
+    def copy_memory(self, body: int) -> Float64 | None:
+        """Returns memory (blocks, 3, 3) that the loop brings the next matrix of a body to by itself: as target of
+        `request_matrix` it saves a copy. The matrix behind that one leaves it alone. None: there is none such."""
+        ...
+
     def request_positions(self, body: int, target: Float64, ahead: float = 0.0) -> None:
         """Has positions, `ahead` [s] further along their velocities, copied into `target` (nodes, 3).
 
@@ -326,6 +335,10 @@ class Engine(Protocol):
 
     def matrix_step(self, body: int) -> int:
         """Returns the number of steps completed before the copy requested last was made; -1: it is not there yet."""
+        ...
+
+    def matrix_steps(self, bodies: Sequence[int]) -> Int64:
+        """Returns `matrix_step` of each of some bodies."""
         ...
 
     def replace(self, launch: int, new: Launch) -> PendingUpdate:

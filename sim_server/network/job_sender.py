@@ -12,6 +12,7 @@ import zenoh
 
 from protocol.channels import PART_BYTES, WHOLE_PARTS, key
 from protocol.counters import Counters
+from protocol.factor import FactorPattern
 from protocol.messages_pb2 import MatrixBatch
 from protocol.method import Method
 from protocol.shared_memory.limits import SLOT_SHARE
@@ -152,10 +153,8 @@ class JobSender:
         if slots is None:
             return [self._send_alone(worker, job) for job in jobs]
         seconds = [leases.lease(job.object, worker, job.method.name) for job in jobs]
-        in_flight = [
-            self._begin(job, worker, lease, slots, factor_slot=slots[1], first=entry.first, room=entry.room)
-            for job, lease, entry in zip(jobs, seconds, entries, strict=True)
-        ]
+        rooms = [(entry.first, entry.room) for entry in entries]
+        in_flight = self._begin(jobs, worker, seconds, slots, slots[1], rooms)
         message = batch_message(entries, in_flight, seconds, self._incarnation, *slots)
         filling, matrices = Filling(slots), [job.values for job in jobs]
         if self._queue.post(partial(self._fill_and_put, message, matrices, in_flight, filling)):
@@ -199,7 +198,7 @@ class JobSender:
         lease = self._book.leases.lease(job.object, worker, job.method.name, job.positions, known.blocks)
         slots = tuple(slot for slot in (matrix_slot, factor_slot) if slot is not None)
         payload_bytes = 0 if matrix_slot else job.values.nbytes
-        in_flight = self._begin(job, worker, lease, slots, factor_slot=factor_slot, payload_bytes=payload_bytes)
+        (in_flight,) = self._begin([job], worker, [lease], slots, factor_slot, [(0, 0)], payload_bytes)
         message = matrix_message(in_flight, known, self._incarnation, lease, job.method)
         payload = add_values(message, job.values, matrix_slot)
         name, attachment = key("matrix", self._server, worker=worker, object=job.object), message.SerializeToString()
@@ -218,7 +217,7 @@ class JobSender:
         if job.method.name == "incomplete_cholesky":
             nonzeros += nonzeros // SLOT_MARGIN  # the next factor may keep more blocks
         size = nonzeros * np.dtype(job.dtype).itemsize
-        if size > max(WHOLE_PARTS * PART_BYTES, self._pool.limit // SLOT_SHARE):
+        if not self._fits_slot(size):
             size = 0  # it comes in parts
         pool, sizes = self._pool, [job.values.nbytes, *([size] if size else [])]
         slots = [pool.lend(each, beside=True) for each in sizes]
@@ -227,38 +226,44 @@ class JobSender:
         matrix, factor = [*slots, None][:2]
         return matrix, factor
 
+    def _fits_slot(self, size: int) -> bool:
+        """True if a factor of so many bytes may come in a slot."""
+        return self._pool is not None and size <= max(WHOLE_PARTS * PART_BYTES, self._pool.limit // SLOT_SHARE)
+
+    def prepare_for(self, pattern: FactorPattern) -> None:
+        """Has the slot for a large factor, or for its parts, made beside the caller before its first job."""
+        if self._pool is not None:
+            self._pool.prepare(size if self._fits_slot(size := 4 * pattern.nonzeros) else PART_BYTES)
+
     # ---- both ------------------------------------------------------------------------------------------------
 
     def _begin(
-        self, job: Job, worker: str, lease: float, slots: tuple[Slot, ...], factor_slot: Slot | None, **more: int
-    ) -> InFlightJob:
-        """Begins the lease of a job that is being sent. more: fields of InFlightJob"""
-        now, leases = self._book.clock(), self._book.leases
-        in_flight = InFlightJob(
-            leases.next_number(),
-            job.object,
-            job.epoch,
-            job.step,
-            job.warp,
-            _dtype_name(job.dtype),
-            worker,
-            deadline=now + max(lease, min(leases.deadlines().get(worker, 0.0) - now, BEHIND)),
-            factor_slot=factor_slot,
-            factor_generation=factor_slot.generation if factor_slot else 0,
-            slots=slots,
-            sent_at=now,
-            exclusive_until=now + leases.exclusive_period(job.object, self._book.decoder.objects[job.object].blocks),
-            method=job.method.name,
-            positions=job.positions,
-            part_bytes=PART_BYTES,
-            **more,
-        )
-        leases.start(in_flight)
-        return in_flight
+        self, jobs: Sequence[Job], worker: str, seconds: Sequence[float], slots: tuple[Slot, ...],
+        factor_slot: Slot | None, rooms: Sequence[tuple[int, int]], payload_bytes: int = 0,
+    ) -> list[InFlightJob]:  # fmt: skip
+        """Begins the leases of jobs that are being sent together.
+
+        seconds: that the worker has for each. rooms: first byte and bytes of each in the slot of the factors
+        """
+        now, leases, objects = self._book.clock(), self._book.leases, self._book.decoder.objects
+        latest, generation = leases.deadlines().get(worker, 0.0), factor_slot.generation if factor_slot else 0
+        begun: list[InFlightJob] = []
+        for job, lease, (first, room) in zip(jobs, seconds, rooms, strict=True):
+            deadline = now + max(lease, min(latest - now, BEHIND))
+            latest = max(latest, deadline)
+            begun.append(
+                InFlightJob(
+                    leases.next_number(), job.object, job.epoch, job.step, job.warp, _dtype_name(job.dtype), worker,
+                    deadline, factor_slot, generation, slots, first, room, now,
+                    now + leases.exclusive_period(job.object, objects[job.object].blocks), job.method.name,
+                    payload_bytes, job.positions, PART_BYTES,
+                )
+            )  # fmt: skip
+        leases.start_all(begun)
+        return begun
 
     def _on_sent(self, worker: str, jobs: Sequence[Job]) -> None:
-        for job in jobs:
-            self._book.last_worker[job.object] = worker
+        self._book.last_worker.update((job.object, worker) for job in jobs)
         self._book.reliability.on_sent(worker, self._book.clock())
         self._counters.add("jobs", len(jobs))
         self._counters.add("bytes_out", sum(job.values.nbytes for job in jobs))
@@ -282,8 +287,9 @@ class JobSender:
         )
         if not drop and time.perf_counter() - begin < FAST_SEND:
             self._fast_links.add(worker)
+        now = self._book.clock()
         for job in jobs:
-            self._sent[job.number] = self._book.clock()
+            self._sent[job.number] = now
 
 
 @cache

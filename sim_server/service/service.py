@@ -121,6 +121,16 @@ class Service:
             return None
         return FirstFactors(driver)
 
+    def ready(self) -> bool:
+        """False while a worker, shared memory or the device is made ready for the first factors. Takes in what workers
+        tell of them."""
+        if not self.driver.wants_factors:
+            return True
+        dispatch = self.link.dispatch
+        self.driver.expect_factors(dispatch)
+        idle = any(worker.idle for worker in dispatch.workers())
+        return idle and not dispatch.makes_slots() and self.engine.expects_factors()
+
     def supervise(self, supervisor: "Supervisor") -> None:
         """Has the local workers of `supervisor` restarted, shown in the status, added and killed by clients."""
         self.check_workers, self.link.local_workers = supervisor.check, supervisor.local_workers

@@ -203,11 +203,12 @@ class Driver:
 
     def _job(self, state: BodyUpdateState, step: int, values: NDArray[np.float64]) -> Job:
         name, epoch = state.body.name, self.simulation.epoch(state.body.name, step)
-        if self.simulation.splits is not None and values.ndim == 3:  # the copy has room for more blocks
-            values = values[: len(self._patterns.at(name, epoch)[1])]
-        if self.source.epoch(name) not in (None, epoch):
-            for begin in self.on_epoch:
-                begin(state.body, epoch)
+        if self.simulation.splits is not None:
+            if values.ndim == 3:  # the copy has room for more blocks
+                values = values[: len(self._patterns.at(name, epoch)[1])]
+            if self.source.epoch(name) not in (None, epoch):
+                for begin in self.on_epoch:
+                    begin(state.body, epoch)
         method = self.solver.method if state.tuner is None else state.tuner.factorization.method
         state.on_job(step, method)
         return Job(name, epoch, step, self._warped[name], values, self.solver.factor_dtype, method)
@@ -218,13 +219,17 @@ class Driver:
         """Passes on the factors that a source has made since the last call, and takes note of failed jobs and of
         patterns that factors will have."""
         self._end_checks()
-        for name, pattern in source.patterns():
-            self.engine.expect_factors(self.by_name[name].body.index, pattern)
+        self.expect_factors(source)
         behind, self._behind = self._behind, []
         if factors := [*behind, *source.poll()]:
             on_factors(factors)
         for name, reason in source.failures():
             self.fail(name, reason)
+
+    def expect_factors(self, source: FactorSource) -> None:
+        """Has the loop prepare for the factors whose patterns have come."""
+        for name, pattern in source.patterns():
+            self.engine.expect_factors(self.by_name[name].body.index, pattern)
 
     def adopt(self, factors: Sequence[Factor], now: bool = False) -> None:
         """Puts factors into the mailboxes of their bodies, unless a newer one is there or the check refuses it.

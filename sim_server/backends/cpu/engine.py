@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from protocol.factor import Factor, FactorPattern
-from sim_server.arrays import Float64, Int32
+from sim_server.arrays import Float64, Int32, Int64
 from sim_server.backends.base import ArrayChange, Capability, EngineInput, Launch
 from sim_server.backends.cpu import structs
 from sim_server.backends.cpu.contact import NativeContact
@@ -332,6 +332,10 @@ class CpuEngine(Reports):
     def expect_factors(self, body: int, pattern: FactorPattern) -> None:
         """Does nothing: a factor is applied as it comes."""
 
+    def expects_factors(self) -> bool:
+        """Returns True."""
+        return True
+
     def resume_factor(self, body: int, pattern: FactorPattern, values: NDArray[Any], step: int) -> None:
         """Posts the factor that was in use when the state was saved; what is known of its correction holds."""
         buffer = self._mail[body].free_buffer(pattern, values.dtype)
@@ -382,6 +386,14 @@ class CpuEngine(Reports):
     def matrix_step(self, body: int) -> int:
         """Step of the copy asked for last, -1 while it is not there. `step` counts the steps completed before it."""
         return int(self._body[body].snapshot_step)
+
+    def matrix_steps(self, bodies: Sequence[int]) -> Int64:
+        """The same of some bodies."""
+        return np.array([self._body[body].snapshot_step for body in bodies], np.int64)
+
+    def copy_memory(self, body: int) -> None:
+        """The loop copies to where it is told."""
+        return None
 
     def stage(self, changes: Sequence[ArrayChange]) -> list[ArrayChange]:
         """Returns the changes, which are ready."""

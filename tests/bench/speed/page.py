@@ -8,12 +8,13 @@ from tests.bench.harness.report import Report
 from tests.bench.speed.targets import TARGETS, Target
 
 Row = dict[str, Any]
-KEYS = ("what", "tets", "material", "beams", "threads", "side")
+KEYS = ("what", "tets", "material", "beams", "threads", "settings", "side")
 
 
 def of(rows: Sequence[Row], where: Row, side: str) -> Row | None:
     """The row of a side that a target means."""
-    return next((r for r in rows if r["side"] == side and all(r.get(k) == v for k, v in where.items())), None)
+    wanted = {"side": side, "settings": None, **where}
+    return next((row for row in rows if all(row.get(k) == v for k, v in wanted.items())), None)
 
 
 def _told(row: Row | None, target: Target) -> str:

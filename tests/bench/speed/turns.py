@@ -126,7 +126,9 @@ def sofa(sides: Sides, tets: int, rounds: int) -> list[Row]:
     return rows
 
 
-def steps(sides: Sides, problem: Problem, rounds: int, library: str, device: str, long: int = 0) -> list[Row]:
+def steps(
+    sides: Sides, problem: Problem, rounds: int, library: str, device: str, long: int = 0, settings: Sequence[str] = ()
+) -> list[Row]:  # fmt: skip
     """Steps with factors at most AGE steps old. long: of them without a pause after that, for the host's time."""
     for name, answer in everywhere(
         sides, "load", name="beam", text=problem.text(), overrides=[], device=device
@@ -140,6 +142,7 @@ def steps(sides: Sides, problem: Problem, rounds: int, library: str, device: str
     runs = {name: [side("run", name="beam", steps=long)] if long else found[name] for name, side in sides.items()}
     everywhere(sides, "drop", name="beam")
     label = {"what": "steps", "tets": problem.tets, "material": problem.material, "beams": problem.beams}
+    label |= {"settings": " ".join(settings)} if settings else {}
     return [
         {**label, "side": name, **_ms(rows), "most": max(row["most"] for row in rows),
          "residual": max(row["residual"] for row in rows),
