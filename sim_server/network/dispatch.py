@@ -135,6 +135,11 @@ class Dispatch(FactorSource):
             infos = (self._registry.info(name) for name in self._book.available())
             return [info for info in infos if info is not None]
 
+    def worker_info(self, name: str) -> WorkerInfo | None:
+        """Returns the last heartbeat of a worker; None if it has left."""
+        with self._lock:
+            return self._registry.info(name)
+
     def unclaimed_tokens(self) -> int:
         """Number of tokens of workers that have sent no heartbeat. A probe for tests."""
         with self._lock:
