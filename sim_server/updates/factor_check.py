@@ -19,7 +19,7 @@ from protocol.factor import Factor, FactorPattern
 from sim_server.arrays import Int32
 from sim_server.backends.compiler import native
 from sim_server.backends.cpu import structs
-from sim_server.backends.cpu.engine import NativePattern
+from sim_server.backends.cpu.factors import NativePattern
 from sim_server.updates.patterns import Patterns
 
 Reals = NDArray[np.float64]

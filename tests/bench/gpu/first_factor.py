@@ -39,7 +39,8 @@ def measure(
     first: solver.first_factor. Returns: files that were new in the caches; seconds from the start of the process to the
     first answer; steps and seconds until a step used a factor; of the status queries the number, how many failed, and
     the longest [ms]; of the factors in the last half their number a second, mean age [steps] and time from the step of
-    the matrix to the first step that uses it [ms]; times of the steps in that half [ms]
+    the matrix to the first step that uses it [ms]; times of the steps in that half [ms];
+    matrices and factors that stayed in memory of the device
     """
     with tempfile.TemporaryDirectory() as folder:
         scene = Problem(tets, dt=dt).write(Path(folder))
@@ -101,6 +102,7 @@ def _watched(endpoint: str, seconds: float, dt: float, started: float) -> Row:
             "in use s": used, "in use step": step_of_use, "queries": len(waits), "failed": failed,
             "answer ms p50": float(np.percentile(milliseconds, 50)), "answer ms max": float(milliseconds.max()),
             **_of_steps(steps, dt), "late steps": int(status.late_steps),
+            "arrays on device": int(status.bulk_on_device),
         }  # fmt: skip
 
 
