@@ -52,9 +52,11 @@ def set_up(closing: ExitStack, o: Options) -> tuple[Service, Supervisor | None]:
         link = closing.enter_context(
             ServerLink(o.name, o.listen, o.connect, shared_memory=o.shared_memory, tls=checked.certificates.server)
         )
-        recorder = None
+        recorder, supervisor = None, None
         if o.record is not None:
             recorder = closing.enter_context(_recorder(o.record, checked.rotation, simulation))
+        if o.workers and not simulation.scene.integrator.explicit:  # which needs none
+            supervisor = _start_workers(closing, o, link, checked.certificates)  # they take a second to come
         service = _service(o, simulation, link, recorder, checked.checkpoint)
         if checked.metrics is not None:
             _serve_metrics(closing, service, *checked.metrics)
@@ -65,9 +67,8 @@ def set_up(closing: ExitStack, o: Options) -> tuple[Service, Supervisor | None]:
     except (BadEndpoint, ConnectionFailed, Refused, CompileError) as error:
         raise InputError(str(error)) from None
     _warn_of_exposure(o)
-    supervisor = None
-    if o.workers and not simulation.scene.integrator.explicit:  # which needs none
-        supervisor = _start_workers(closing, o, service, checked.certificates)
+    if supervisor is not None:
+        service.supervise(supervisor)
     if checked.page is not None:
         _start_page(closing, o, service, checked.certificates, *checked.page)
     return service, supervisor
@@ -134,13 +135,12 @@ def _warn_of_exposure(o: Options) -> None:
         )  # fmt: skip
 
 
-def _start_workers(closing: ExitStack, o: Options, service: Service, certificates: Certificates) -> Supervisor:
+def _start_workers(closing: ExitStack, o: Options, link: ServerLink, certificates: Certificates) -> Supervisor:
     options = ["--device", o.worker_device, *certificates.for_worker]
-    if not service.link.shared_memory:  # which was told, once
+    if not link.shared_memory:  # which was told, once
         options.append("--no-shared-memory")
     supervisor = Supervisor(o.workers, o.name, [certificates.local_endpoint], options)
     closing.callback(supervisor.close)
-    service.supervise(supervisor)
     return supervisor
 
 

@@ -13,6 +13,7 @@ import pytest
 from protocol.factor import Factor
 from sim_server.backends.cpu.device import module
 from sim_server.backends.cpu.engine import CpuEngine
+from sim_server.backends.cpu.library import loop_library
 from sim_server.backends.cpu.structs import RECORD
 from sim_server.backends.kinds import Kind
 from sim_server.simulation import Simulation
@@ -174,7 +175,7 @@ def test_a_factor_just_taken_out_of_the_mailbox_is_not_overwritten():
     sim.engine.run(1)
     sim.engine.post_factor(0, pattern, values * 2, 2)
     body = sim.engine._body[0]
-    taken = sim.engine._native.wf_post_factor(ctypes.byref(body), None)  # as the loop does it
+    taken = loop_library().wf_post_factor(ctypes.byref(body), None)  # as the loop does it
     sim.engine.post_factor(0, pattern, values * 3, 3)
     buffer = next(b for b in sim.engine.factor_buffers(0) if b.address == taken)
     assert buffer.native.step == 2

@@ -17,11 +17,13 @@ from sim_server.backends.compiler import SOURCES
 from sim_server.backends.gpu.correction import FactorCorrection
 from sim_server.backends.gpu.cupy_types import DeviceArray, KernelFunction
 from sim_server.backends.gpu.device import Gpu, compiled, options, own_headers
+from sim_server.backends.gpu.device_values import DeviceValues
 from sim_server.backends.gpu.followed_rows import FollowedRows
 from sim_server.backends.gpu.inverse.build_inverse import InverseBuilder, PartitionedInverse, builder_kernels
+from sim_server.backends.gpu.inverse.device_digits import LARGE, LargeFactors, digits_kernels
 from sim_server.backends.gpu.inverse.device_plan import DevicePlan, shared_bytes
 from sim_server.backends.gpu.inverse.digits import library as digits_library
-from sim_server.backends.gpu.inverse.digits import planes_for
+from sim_server.backends.gpu.inverse.digits import planes_of
 from sim_server.backends.gpu.inverse.plan import plan
 from sim_server.backends.gpu.row_partition import SPARED, best_assignment, halo, initial_ranges, lists_of
 from sim_server.backends.gpu.structs import CONTACT, CORRECTION, PCG, PCG_RESULT, STAGES
@@ -151,11 +153,13 @@ class PcgSolver:
         self._application = self._compiled(application, blocks) if application else None
         self._device = cp.cuda.Device()
         self._planner = ThreadPoolExecutor(1, "plans of inverses")
+        self._large = LargeFactors(gpu)
         if planes is None:
             digits_library()  # before a factor waits for it
         self._lock = threading.Lock()
         self._plans: dict[tuple[int, int, int], Future[PlannedInverse]] = {}  # by pattern, planes, thread blocks
         self._vectors: dict[tuple[int, int], dict[str, DeviceArray]] = {}  # by body and plan
+        self._plan_in_row: dict[int, DevicePlan] = {}  # by body
         self._factor_bytes = [0] * len(ranges)
 
     @property
@@ -265,10 +269,21 @@ class PcgSolver:
     def compile_builder(self) -> None:
         """Has the kernels that build inverses compiled beside the caller, before a factor waits for them."""
         self.beside(lambda: builder_kernels(self.gpu))
+        if self.planes is None:
+            self.beside(lambda: digits_kernels(self.gpu))
 
-    def planes_for(self, pattern: FactorPattern, values: NDArray[Any]) -> int:
-        """Returns the float16 numbers per entry that the inverse of a factor gets. From any thread."""
-        return planes_for(pattern, values) if self.planes is None else self.planes
+    def planes_of(self, factors: Sequence[tuple[FactorPattern, NDArray[Any]]]) -> list[int]:
+        """Returns the float16 numbers per entry that the inverse of each of some factors gets. From any thread."""
+        return planes_of(factors) if self.planes is None else [self.planes] * len(factors)
+
+    def brought(self, values: NDArray[Any] | DeviceValues) -> NDArray[Any] | DeviceValues:
+        """Returns values of a large factor on the device, if there is memory for them. In the thread of the plans."""
+        return self._large.brought(values)
+
+    def planes_on_device(self, pattern: FactorPattern, values: DeviceValues, multiprocessors: int | None) -> int:
+        """As `planes_of`, estimated on the device. In the thread of the plans. multiprocessors: that this keeps busy
+        at most; None: all"""
+        return self._large.planes_for(pattern, values, multiprocessors) if self.planes is None else self.planes
 
     def beside(self, work: Callable[[], T]) -> Future[T]:
         """Has work done in the thread of the plans, one after another."""
@@ -293,6 +308,12 @@ class PcgSolver:
         made.add_done_callback(partial(self._forget_failed, key))
         return made
 
+    @property
+    def plans_made(self) -> bool:
+        """True if no plan is being made."""
+        with self._lock:
+            return all(made.done() for made in self._plans.values())
+
     def _forget_failed(self, key: tuple[int, int, int], made: Future[PlannedInverse]) -> None:
         """Has a plan that could not be made tried again the next time: memory may be free then."""
         if made.exception() is not None:
@@ -309,6 +330,8 @@ class PcgSolver:
             )
         alike = (3 * self.bodies["nodes"] == pattern.size) & (self.bodies["blocks"] == blocks)
         builder = InverseBuilder(self.gpu, pattern, found, int(alike.sum()))
+        if self.planes is None and 4 * pattern.nonzeros > LARGE:
+            self._large.expect(pattern)
         return PlannedInverse(DevicePlan(self.gpu, found, self.threads // 32), builder)
 
     def plan(self, body: int, pattern: FactorPattern, planes: int) -> DevicePlan:
@@ -328,8 +351,11 @@ class PcgSolver:
     def use(self, body: int, pattern: FactorPattern, inverse: PartitionedInverse, planes: int, step: int) -> None:
         """Writes a factor into the host row of a body; it is in use once the row is uploaded."""
         device_plan, row = self.plan(body, pattern, planes), self.bodies[body]
-        row["plan"], row["matrix"], row["scale"] = device_plan.address, inverse.matrix, inverse.scale
-        row["planes"], row["factor_step"] = planes, step
+        row["matrix"], row["scale"], row["factor_step"] = inverse.matrix, inverse.scale, step
+        if self._plan_in_row.get(body) is device_plan:
+            return
+        self._plan_in_row[body] = device_plan
+        row["plan"], row["planes"] = device_plan.address, planes
         self.reserve_vectors(body, device_plan)
         for name, array in self._vectors[body, device_plan.address].items():
             row[name] = array.data.ptr
