@@ -11,6 +11,7 @@ from typing import Protocol
 
 from protocol.refused import Refused
 from protocol.shared_memory.pool import Slot
+from sim_server.network.device_slots import DeviceSlot
 
 MIN_LEASE = 2.0  # s
 MAX_LEASE = 120.0  # s; also for the first job of an object at a worker, which may compile, import and analyse for it
@@ -28,7 +29,7 @@ MAX_EXPIRED = 2  # expired jobs with which a worker still gets slots of shared m
 class SlotAllocator(Protocol):
     """The pool that slots go back to."""
 
-    def give_back(self, slot: Slot, users: int = 1) -> None:
+    def give_back(self, slot: Slot | DeviceSlot, users: int = 1) -> None:
         """Frees a slot that so many jobs used."""
 
 
@@ -39,11 +40,12 @@ class InFlightJob:
     number: of the job, unique in the life of the server
     sent_at, deadline: begin and end of its lease
     exclusive_until: from then on another worker may be asked for the object
-    slots: shared memory allocated for the matrix and the factor
+    slots: shared memory allocated for the matrix and the factor, of the host or of a device
     room: bytes of the factor slot that are for this job, from `first` on
     payload_bytes: size of the values if they are in no slot
     positions: they are positions, from which the worker assembles the matrix
     part_bytes: of each part of a factor that travels in parts
+    device_slot, device_generation: in place of factor_slot, of a device
     """
 
     number: int
@@ -56,7 +58,7 @@ class InFlightJob:
     deadline: float
     factor_slot: Slot | None = None
     factor_generation: int = 0
-    slots: tuple[Slot, ...] = ()
+    slots: tuple[Slot | DeviceSlot, ...] = ()
     first: int = 0
     room: int = 0
     sent_at: float = 0.0
@@ -65,6 +67,8 @@ class InFlightJob:
     payload_bytes: int = 0
     positions: bool = False
     part_bytes: int = 0
+    device_slot: DeviceSlot | None = None
+    device_generation: int = 0
 
 
 class Leases:

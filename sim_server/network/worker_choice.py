@@ -80,6 +80,11 @@ class WorkerChoice:
         expired = self._book.leases.expired_count(worker)
         return self._shared and info is not None and info.shared_memory and expired < MAX_EXPIRED
 
+    def shares_device(self, worker: str) -> bool:
+        """True if a worker opens device memory of this server: only one on this host, of the same user, is asked to."""
+        info = self._book.registry.info(worker)
+        return info is not None and info.device_memory and self.has_slots(worker)
+
     def takes_batches(self, worker: str) -> bool:
         """True if several jobs of a worker may share a message. It has room for several only where all objects are
         small."""

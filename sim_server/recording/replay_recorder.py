@@ -16,7 +16,6 @@ import numpy as np
 
 from protocol import messages_pb2 as pb
 from protocol.factor import Factor
-from protocol.validate import checksum
 from sim_server.arrays import Float64
 from sim_server.backends.base import PendingUpdate
 from sim_server.effects._base import Effect
@@ -132,7 +131,7 @@ class ReplayRecorder:
         library = maker.library if exact else "native"
         return pb.FactorUse(
             header=pb.Header(object=factor.object, epoch=factor.epoch), step=factor.step, pattern=factor.pattern.id,
-            checksum=checksum(factor.values), dtype=factor.values.dtype.name, worker=factor.worker,
+            checksum=factor.checksum(), dtype=factor.values.dtype.name, worker=factor.worker,
             library=library, threads=maker.threads, seconds=factor.seconds, remedy=factor.remedy,
             method=factor.method, ahead=factor.ahead, later=factor.later,
         )  # fmt: skip

@@ -198,6 +198,7 @@ def made(folder: Path, library: Any) -> ModuleType:
         runtime=SimpleNamespace(
             getDeviceCount=lambda: 1, CUDARuntimeError=type("CUDARuntimeError", (RuntimeError,), {}),
             getDeviceProperties=lambda number: properties, memcpyDeviceToDevice=3, memcpyHostToDevice=1,
+            memcpyDeviceToHost=2, memcpyDefault=4,
             runtimeGetVersion=lambda: 13000, **memory,
         ),
         Device=lambda *a: SimpleNamespace(

@@ -325,6 +325,14 @@ class CpuEngine(Reports):
     def drop_factor(self, body: int, factor: Factor) -> None:
         """Does nothing."""
 
+    def shared_memory(self) -> None:
+        """Returns None: matrices and factors are on the host."""
+        return
+
+    def staged_matrix(self, body: int) -> int:
+        """Returns 0, likewise."""
+        return 0
+
     def factor_memory(self, count: int, dtype: np.dtype[Any]) -> NDArray[Any]:
         """Makes an array for values of a factor."""
         return np.empty(count, dtype)

@@ -17,8 +17,10 @@ from sim_server.backends.compiler import SOURCES
 from sim_server.backends.gpu.correction import FactorCorrection
 from sim_server.backends.gpu.cupy_types import DeviceArray, KernelFunction
 from sim_server.backends.gpu.device import Gpu, compiled, options, own_headers
+from sim_server.backends.gpu.device_values import DeviceValues
 from sim_server.backends.gpu.followed_rows import FollowedRows
 from sim_server.backends.gpu.inverse.build_inverse import InverseBuilder, PartitionedInverse, builder_kernels
+from sim_server.backends.gpu.inverse.device_digits import LARGE, LargeFactors, digits_kernels
 from sim_server.backends.gpu.inverse.device_plan import DevicePlan, shared_bytes
 from sim_server.backends.gpu.inverse.digits import library as digits_library
 from sim_server.backends.gpu.inverse.digits import planes_of
@@ -151,6 +153,7 @@ class PcgSolver:
         self._application = self._compiled(application, blocks) if application else None
         self._device = cp.cuda.Device()
         self._planner = ThreadPoolExecutor(1, "plans of inverses")
+        self._large = LargeFactors(gpu)
         if planes is None:
             digits_library()  # before a factor waits for it
         self._lock = threading.Lock()
@@ -266,10 +269,21 @@ class PcgSolver:
     def compile_builder(self) -> None:
         """Has the kernels that build inverses compiled beside the caller, before a factor waits for them."""
         self.beside(lambda: builder_kernels(self.gpu))
+        if self.planes is None:
+            self.beside(lambda: digits_kernels(self.gpu))
 
     def planes_of(self, factors: Sequence[tuple[FactorPattern, NDArray[Any]]]) -> list[int]:
         """Returns the float16 numbers per entry that the inverse of each of some factors gets. From any thread."""
         return planes_of(factors) if self.planes is None else [self.planes] * len(factors)
+
+    def brought(self, values: NDArray[Any] | DeviceValues) -> NDArray[Any] | DeviceValues:
+        """Returns values of a large factor on the device, if there is memory for them. In the thread of the plans."""
+        return self._large.brought(values)
+
+    def planes_on_device(self, pattern: FactorPattern, values: DeviceValues, multiprocessors: int | None) -> int:
+        """As `planes_of`, estimated on the device. In the thread of the plans. multiprocessors: that this keeps busy
+        at most; None: all"""
+        return self._large.planes_for(pattern, values, multiprocessors) if self.planes is None else self.planes
 
     def beside(self, work: Callable[[], T]) -> Future[T]:
         """Has work done in the thread of the plans, one after another."""
@@ -316,6 +330,8 @@ class PcgSolver:
             )
         alike = (3 * self.bodies["nodes"] == pattern.size) & (self.bodies["blocks"] == blocks)
         builder = InverseBuilder(self.gpu, pattern, found, int(alike.sum()))
+        if self.planes is None and 4 * pattern.nonzeros > LARGE:
+            self._large.expect(pattern)
         return PlannedInverse(DevicePlan(self.gpu, found, self.threads // 32), builder)
 
     def plan(self, body: int, pattern: FactorPattern, planes: int) -> DevicePlan:

@@ -23,7 +23,6 @@ import numpy as np
 from clients.client import Client
 from clients.errors import ClientError
 from protocol import messages_pb2 as pb
-from protocol.process.cache_folder import cache_folder
 from tests.bench.gpu.problem import Problem
 from tests.ports import free_endpoint
 
@@ -40,7 +39,8 @@ def measure(
     first: solver.first_factor. Returns: files that were new in the caches; seconds from the start of the process to the
     first answer; steps and seconds until a step used a factor; of the status queries the number, how many failed, and
     the longest [ms]; of the factors in the last half their number a second, mean age [steps] and time from the step of
-    the matrix to the first step that uses it [ms]; times of the steps in that half [ms]
+    the matrix to the first step that uses it [ms]; times of the steps in that half [ms];
+    matrices and factors that stayed in memory of the device
     """
     with tempfile.TemporaryDirectory() as folder:
         scene = Problem(tets, dt=dt).write(Path(folder))
@@ -66,9 +66,11 @@ def served(scene: Path, first: str, device: str, worker: str, seconds: float, dt
 
 
 def _kept() -> set[Path]:
-    """Returns the files in the caches of compiled kernels, orders and patterns."""
-    kernels = os.environ.get("CUPY_CACHE_DIR", str(Path.home() / ".cupy" / "kernel_cache"))
-    return {path for folder in (cache_folder(), Path(kernels)) for path in folder.rglob("*") if path.is_file()}
+    """Returns the files in the caches of compiled kernels, orders and patterns, of a checkout of any commit."""
+    home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    ours = Path(os.environ.get("WARPFACTOR_CACHE") or home / "warpfactor")
+    kernels = Path(os.environ.get("CUPY_CACHE_DIR") or Path.home() / ".cupy" / "kernel_cache")
+    return {path for folder in (ours, kernels) for path in folder.rglob("*") if path.is_file()}
 
 
 def _watched(endpoint: str, seconds: float, dt: float, started: float) -> Row:
@@ -100,6 +102,7 @@ def _watched(endpoint: str, seconds: float, dt: float, started: float) -> Row:
             "in use s": used, "in use step": step_of_use, "queries": len(waits), "failed": failed,
             "answer ms p50": float(np.percentile(milliseconds, 50)), "answer ms max": float(milliseconds.max()),
             **_of_steps(steps, dt), "late steps": int(status.late_steps),
+            "arrays on device": int(status.bulk_on_device),
         }  # fmt: skip
 
 
