@@ -23,7 +23,6 @@ import numpy as np
 from clients.client import Client
 from clients.errors import ClientError
 from protocol import messages_pb2 as pb
-from protocol.process.cache_folder import cache_folder
 from tests.bench.gpu.problem import Problem
 from tests.ports import free_endpoint
 
@@ -67,9 +66,11 @@ def served(scene: Path, first: str, device: str, worker: str, seconds: float, dt
 
 
 def _kept() -> set[Path]:
-    """Returns the files in the caches of compiled kernels, orders and patterns."""
-    kernels = os.environ.get("CUPY_CACHE_DIR", str(Path.home() / ".cupy" / "kernel_cache"))
-    return {path for folder in (cache_folder(), Path(kernels)) for path in folder.rglob("*") if path.is_file()}
+    """Returns the files in the caches of compiled kernels, orders and patterns, of a checkout of any commit."""
+    home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    ours = Path(os.environ.get("WARPFACTOR_CACHE") or home / "warpfactor")
+    kernels = Path(os.environ.get("CUPY_CACHE_DIR") or Path.home() / ".cupy" / "kernel_cache")
+    return {path for folder in (ours, kernels) for path in folder.rglob("*") if path.is_file()}
 
 
 def _watched(endpoint: str, seconds: float, dt: float, started: float) -> Row:

@@ -49,7 +49,8 @@ TABLES = (
         "threads",
         "One body on the threads of a CPU",
         "SOFA's beam (below) on `[solver] threads`: turns of 8 steps with a factor of their first matrix, the same "
-        "for both; wall ms of steps.",
+        "for both; wall ms of steps. GB/s of L: bytes of the factor that its solves read, twice an iteration, over "
+        "the time of the whole solve.",
     ),
     (
         "sofa",

@@ -106,8 +106,10 @@ def threads(sides: Sides, tets: int, numbers: Sequence[int], turns: int) -> list
     for n in numbers:
         everywhere(sides, "drop", name=f"{n}")
     return [
-        {"what": "threads", "tets": tets, "threads": n, "side": side, **_ms(rows)} for (side, n), rows in found.items()
-    ]
+        {"what": "threads", "tets": tets, "threads": n, "side": side, **_ms(rows),
+         "GB/s of L": float(np.median([row["GB/s"] for row in rows]))}
+        for (side, n), rows in found.items()
+    ]  # fmt: skip
 
 
 def sofa(sides: Sides, tets: int, rounds: int) -> list[Row]:
