@@ -115,7 +115,7 @@ class SolverOptions(Parameters):
         default="freeze", description="treatment of a body with more energy than accounted for"
     )
     threads: int = Field(default=1, ge=1, le=1024, description="of the simulation on a CPU")
-    warm_start: bool = Field(default=True, description="start from the last step's dv")
+    warm_start: bool = Field(default=True, description="start from what the last steps' solutions say of this one")
     woodbury: int = Field(
         default=32, ge=0, le=64,
         description="correct factors for grabs and contacts since, of at most this many nodes of an object; 0: off",
