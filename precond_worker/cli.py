@@ -160,7 +160,7 @@ def _serve(
     from protocol.network.identity import usual_identity
     from protocol.network.metrics_server import MetricsServer, metrics_address
     from protocol.network.session import Session
-    from protocol.process.long_lived import keep_long_lived
+    from protocol.process.memory import keep_long_lived
     from protocol.process.notify import Notifier
     from protocol.refused import Refused
 

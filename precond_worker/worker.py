@@ -20,8 +20,8 @@ from precond_worker.factorization.registry import DeviceFactorization, Factoriza
 from precond_worker.job import Job, accept
 from precond_worker.network.presence import ServerGone, ServersThere
 from precond_worker.network.server_connection import ServerConnection
-from precond_worker.preparation import LEAST_NODES, objects_to_prepare
 from precond_worker.remote_assembly import Assemblers
+from precond_worker.symbolic.preparation import LEAST_NODES, objects_to_prepare
 from protocol.channels import WHOLE_PARTS
 from protocol.factor import FactorPattern
 from protocol.messages_pb2 import Factor, Topology

@@ -14,7 +14,7 @@ import typer
 
 from protocol.network.endpoints import default_endpoint
 from protocol.process.command_line import Program, Terminated, end_in_order
-from protocol.process.long_lived import keep_long_lived
+from protocol.process.memory import keep_long_lived
 from protocol.process.notify import Notifier
 from sim_server.errors import DeviceLost, InputError
 from sim_server.service.compile_notice import compile_notices

@@ -56,8 +56,8 @@ def set_up(closing: ExitStack, o: Options) -> tuple[Service, Supervisor | None]:
         if o.record is not None:
             recorder = closing.enter_context(_recorder(o.record, checked.rotation, simulation))
         if o.workers and not simulation.scene.integrator.explicit:  # which needs none
-            supervisor = _start_workers(closing, o, link, checked.certificates)  # they take a second to come
-        service = _service(o, simulation, link, recorder, checked.checkpoint)
+            supervisor = start_workers(closing, o, link, checked.certificates)  # they take a second to come
+        service = make_service(o, simulation, link, recorder, checked.checkpoint)
         if checked.metrics is not None:
             _serve_metrics(closing, service, *checked.metrics)
     except AddressInUse as error:
@@ -107,9 +107,10 @@ def _recorder(record: Path, rotation: Rotation, simulation: Simulation) -> Recor
     return Recorder(path, compression, overwrite=True, report=logging.error, rotation=rotation)
 
 
-def _service(
+def make_service(
     o: Options, simulation: Simulation, link: ServerLink, recorder: Recorder | None, checkpoint: Checkpoint | None
 ) -> Service:  # fmt: skip
+    """Builds the service, from a checkpoint if there is one. Raises InputError."""
     try:
         return Service(simulation, link, recorder, o.steps, o.realtime, checkpoint)
     except InputError as error:
@@ -135,7 +136,8 @@ def _warn_of_exposure(o: Options) -> None:
         )  # fmt: skip
 
 
-def _start_workers(closing: ExitStack, o: Options, link: ServerLink, certificates: Certificates) -> Supervisor:
+def start_workers(closing: ExitStack, o: Options, link: ServerLink, certificates: Certificates) -> Supervisor:
+    """Starts the local workers, which end with `closing`."""
     options = ["--device", o.worker_device, *certificates.for_worker]
     if not link.shared_memory:  # which was told, once
         options.append("--no-shared-memory")

@@ -4,7 +4,7 @@
 import gc
 import weakref
 
-from protocol.process.long_lived import keep_long_lived
+from protocol.process.memory import keep_long_lived
 
 
 class Node:

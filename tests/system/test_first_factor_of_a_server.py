@@ -134,8 +134,8 @@ def test_workers_start_before_the_service_is_built_and_end_if_it_cannot_be(
         events.append("service")
         raise InputError("spoiled")
 
-    monkeypatch.setattr(set_up, "_start_workers", start)
-    monkeypatch.setattr(set_up, "_service", fail)
+    monkeypatch.setattr(set_up, "start_workers", start)
+    monkeypatch.setattr(set_up, "make_service", fail)
     options = Options(
         beam(tmp_path, bar=(1, 1, 2)), [], "cpu", "sim", [free_endpoint()], None, True, None, None, True, 1, "cpu",
         None, True, None, None, False, None, [], None, None, None,
