@@ -28,6 +28,7 @@ from sim_server.backends.gpu.device import DeviceLaunch, Gpu
 from sim_server.backends.gpu.energies import DeviceEnergies
 from sim_server.backends.gpu.factor_upload import FactorUpload
 from sim_server.backends.gpu.held import HeldForces, leading
+from sim_server.backends.gpu.helper import Helper
 from sim_server.backends.gpu.kernel_fusion import DOMAINS, Epilogue, FusedKernel, Prologue, fuse
 from sim_server.backends.gpu.known_patterns import KnownPatterns
 from sim_server.backends.gpu.loop import CAPACITY, GRAPH_STEPS, DeviceLoop
@@ -131,12 +132,13 @@ class GpuEngine(DeviceLoop):
             (given.contact.corner, given.contact.weight) if given.contact and surfaces else ()
         )
         self._prepared = False
+        self._helper = Helper.wanted(gpu, given)
         self.solver = PcgSolver(
             gpu, ranges, arrays, self._counter, CAPACITY, planes,
             phases.of_solves(errors) if phases else (), ATTEMPTS if stages else 0,
             given.contact is not None,
             given.contact is not None and bool(given.contact.surfaces or given.contact.ties), correction, errors,
-            budgets, given.cut,
+            budgets, given.cut, self._helper,
         )  # fmt: skip
         self._newton, newton_results = None, None
         if newton and phases:
@@ -414,7 +416,11 @@ class GpuEngine(DeviceLoop):
         if self.stages:
             self.stages.launch()
         else:
+            if self._helper:
+                self._helper.begin()
             (self._newton or self._contact or self._substeps or self.solver).launch()
+            if self._helper:
+                self._helper.end()
             if self._held:
                 self._held.launch()
             assert self._integrate is not None

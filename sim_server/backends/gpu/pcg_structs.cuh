@@ -63,6 +63,7 @@ struct PcgBody {
     FlagWord<float>* solved;       // (size + 32,) z / d
     FlagWord<float>* contributed;  // contributions of parts below
     int planes;                    // float16 numbers per entry of the inverse
+    int helper;                    // -DHELPED: row in Help.far; 0: no other device has a part of this inverse
 };
 
 // Wall time of a body's search, on the device's clock, as it took last (step_budget.cuh).
