@@ -9,7 +9,10 @@
 #include "block_group.cuh"
 
 constexpr int COMMAND_WORDS = 8;
-constexpr int NEAR_READS = 16777216, FAR_READS = 33554432;  // flags of DevicePlan.target: this device reads a contribution, the other does
+// Flags of a plan's lists (inverse/halves.py): who reads what this device writes. DevicePlan.target, WarpSegment.kind, DevicePlan.place.
+constexpr int NEAR_READS = 16777216, FAR_READS = 33554432;
+constexpr int FORMED_FAR = 4;
+constexpr int RESIDUAL_FAR = 1073741824;
 constexpr unsigned SEQUENCE = 0x9e3779b9u;  // commands of launch k have the numbers SEQUENCE k + 1, + 2, ...: none of the launch before
 
 struct Help {  // of all bodies, argument of pcg.cu

@@ -170,7 +170,7 @@ struct PcgSolver {
         FlagWord<float>& word = to[memory.rows.position(k / 3) + k % 3];
         word.put(scaled, group.number);
 #ifdef HELPED
-        put_far(word, memory.inverse.far, scaled, group.number);
+        if (memory.rows.place[k / 3] & RESIDUAL_FAR) put_far(word, memory.inverse.far, scaled, group.number);
 #endif
     }
 
@@ -569,7 +569,12 @@ struct PcgSolver {
         __syncthreads();
         choose_slots(m, c.share + first, memory.body.nodes, c.capacity);
         compare_blocks(m, c.share + first, c.difference + 6ll * first, c.bodies[body].block);
-        for (int k = threadIdx.x; k < m.used; k += THREADS) m.place[k] = memory.plan.place[m.node[k]];
+        for (int k = threadIdx.x; k < m.used; k += THREADS) {
+            m.place[k] = memory.plan.place[m.node[k]];
+#ifdef HELPED
+            m.place[k] &= ~RESIDUAL_FAR;
+#endif
+        }
         __syncthreads();
         column = m.fresh_count ? 3 * m.fresh[0] : -1;
         return true;

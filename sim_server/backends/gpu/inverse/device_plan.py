@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from sim_server.backends.declarations import Declarations
 from sim_server.backends.gpu.cupy_types import DeviceArray
 from sim_server.backends.gpu.device import Gpu
-from sim_server.backends.gpu.inverse.halves import readers
+from sim_server.backends.gpu.inverse.halves import FarFlags
 from sim_server.backends.gpu.inverse.plan import FORM, GATHER, Plan
 from sim_server.backends.gpu.structs import PCG
 
@@ -143,8 +143,6 @@ class DevicePlan:
         split = warps_per_tile(tiles, tile_start, warps).reshape(plan.blocks, plan.phases)
         target = np.full(plan.contributions + PADDING, len(plan.slots), np.int32)
         target[plan.slots] = np.arange(len(plan.slots), dtype=np.int32)
-        if device is not None:
-            target[plan.slots] |= readers(plan, first, device)
         self._contributions = len(plan.slots) + PADDING
         arrays: dict[str, NDArray[Any]] = {
             "block_ranges": block_ranges(segment_start, tile_start, plan),
@@ -152,6 +150,13 @@ class DevicePlan:
             "segments": cut[segment_order], "index": entry_index(plan, cut[segment_order]), "tiles": tiles,
             "target": target, "place": plan.place,
         }  # fmt: skip
+        if device is not None:
+            far = FarFlags(plan, first, device)
+            phase = np.repeat(np.arange(plan.blocks * plan.phases) % plan.phases, np.diff(tile_start))
+            target[plan.slots] |= far.contributions()
+            arrays["segments"][:, 0] |= far.segments(arrays["segments"])
+            tiles[:, 5] = far.tiles(tiles, phase)
+            arrays["place"] = plan.place | far.places()
         self.arrays = {name: gpu.cp.asarray(array.astype(np.int32, copy=False)) for name, array in arrays.items()}
         params = np.zeros((), DEVICE_PLAN)
         params["phases"], params["blocks"], params["groups"] = plan.phases, plan.blocks, plan.groups

@@ -102,11 +102,11 @@ struct PartitionedInverse {
     long long far;           // bytes from a word to its copy in the memory of the other device; 0: one device alone applies the inverse
 #endif
 
-    // Writes a word that thread blocks of either device may read.
-    __device__ __forceinline__ void put_for_all(FlagWord<float>& word, float v, unsigned number) const {
+    // Writes a word for the thread blocks of this device, and of the other one if `elsewhere`.
+    __device__ __forceinline__ void put_for_all(FlagWord<float>& word, float v, unsigned number, [[maybe_unused]] bool elsewhere) const {
         word.put(v, number);
 #ifdef HELPED
-        put_far(word, far, v, number);
+        if (elsewhere) put_far(word, far, v, number);
 #endif
     }
 
@@ -223,7 +223,7 @@ struct PartitionedInverse {
     __device__ __forceinline__ void put(const WarpSegment& segment, float v, unsigned number, float unit) const {
         const int lane = threadIdx.x % 32;
         put_halves(vector, segment.to + lane, unit * v);
-        if (segment.keep & 1) put_for_all(formed[segment.from + lane], v, number);
+        if (segment.keep & 1) put_for_all(formed[segment.from + lane], v, number, segment.kind != 0);
     }
 
     // Segments of the later phases up to the top: residual minus contributions.
@@ -360,6 +360,7 @@ struct PartitionedInverse {
         double zr = 0;
         int i = 0;
         float d = 0;
+        bool elsewhere = false;  // -DHELPED: the other device reads the result
         FlagWord<float> r, q;  // of d r, for z . r
         auto look_up = [&](const Tile& tile, int row) {  // loads before the product, whose latency hides theirs
             i = tile.out + row;
@@ -367,6 +368,9 @@ struct PartitionedInverse {
                 i = plan->target[i];
                 return;
             }
+#ifdef HELPED
+            elsewhere = tile.elsewhere;
+#endif
             d = scale[i];
             r = from.r[i].load();
             if (from.alpha != 0) q = product[i].load();
@@ -376,7 +380,7 @@ struct PartitionedInverse {
                 put_contribution(i, value, number);
                 return;
             }
-            put_for_all(solved[i], value, number);
+            put_for_all(solved[i], value, number, elsewhere);
             put_for_solver(z[i], d * value, number);
             if (d == 0) return;  // padding
             float ri, qi = 0;
