@@ -50,6 +50,7 @@ Examples:
 """
 
 WORKER_TIMEOUT = 15.0  # s that the start waits for the first local worker, at most
+READY_TIMEOUT = 3.0  # s that it then waits until worker and device are ready for the first factors, at most
 
 
 def list_gallery(asked: bool) -> None:
@@ -239,12 +240,18 @@ def explain_scene(scene: Path, overrides: list[str], device: str, name: str, jso
 
 
 def wait_for_workers(service: "Service", supervisor: "Supervisor | None") -> None:
-    """Waits for the first local worker, WORKER_TIMEOUT at most."""
-    end = time.monotonic() + WORKER_TIMEOUT
-    while supervisor is not None and not service.link.dispatch.workers() and time.monotonic() < end:
-        supervisor.check()
-        service.link.check_name()
-        time.sleep(0.02)
+    """Waits for the first local worker, WORKER_TIMEOUT at most, and then until all is ready for the first factors,
+    READY_TIMEOUT at most."""
+    if supervisor is None:
+        return
+    for there, seconds in ((service.link.dispatch.workers, WORKER_TIMEOUT), (service.ready, READY_TIMEOUT)):
+        end = time.monotonic() + seconds
+        while not there():
+            if time.monotonic() > end:
+                return
+            supervisor.check()
+            service.link.check_name()
+            time.sleep(0.01)
 
 
 def main() -> None:

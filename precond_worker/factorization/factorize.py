@@ -44,6 +44,13 @@ class ManyLibrary(Protocol):
     def begin_many(self, matrices: Sequence[Float64], dtype: np.dtype[np.floating]) -> Together | None: ...
 
 
+@runtime_checkable
+class DeviceLibrary(Protocol):
+    """A library of a device, whose first matrix would wait for memory: GpuFactorization."""
+
+    def make_ready(self, dtype: np.dtype[Any]) -> None: ...
+
+
 class Analysis:
     """Factors of matrices with one block pattern.
 
@@ -90,6 +97,14 @@ class Analysis:
             return self._library.factorize(matrix, kind, out)
         except NotPositiveDefinite as error:
             raise type(error)(self._where(error), error.column) from None
+
+    def make_ready(self, dtype: DTypeLike = np.float32) -> None:
+        """Does before the first matrix what it would wait for: on a GPU memory is taken and the launches are made.
+
+        dtype: of the factors that will be asked for. Raises MemoryError, DeviceUnusable.
+        """
+        if isinstance(self._library, DeviceLibrary):
+            self._library.make_ready(np.dtype(dtype))
 
     @property
     def most(self) -> int:

@@ -61,6 +61,10 @@ class ModifiedCholesky:
                 raise first
             return found
 
+    def make_ready(self) -> None:
+        """Does before the first matrix what it would wait for. Raises MemoryError, DeviceUnusable."""
+        self._analysis.make_ready()
+
     @property
     def most(self) -> int:
         """Number of matrices that are factorized together."""

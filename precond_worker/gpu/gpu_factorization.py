@@ -2,6 +2,7 @@
 """Complete factorizations on the GPU."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +20,7 @@ from protocol.factor import FactorPattern
 
 MOST = 64  # matrices that are factorized together
 COPIES = (1, 4, 16, MOST)  # of a pattern in the plans that are made
+AT_A_TIME = 2  # factors of a matrix alone: one is being sent while the next one is made
 BYTES = 64 << 20  # of the matrices and factors of a launch, about
 
 
@@ -57,6 +59,13 @@ class GpuFactorization:
             return values
         np.copyto(out, values)
         return out
+
+    def make_ready(self, dtype: np.dtype[Any]) -> None:
+        """Takes memory, makes the launches for matrices one by one, and tries them with zeros: the device then has all
+        that it loads at first use, and page-locked memory is there for as many L as are at a time."""
+        executor, zeros = self.executor(dtype.name), np.zeros((self.plan.blocks, 3, 3))
+        together = [executor.run([zeros]) for _ in range(AT_A_TIME)]
+        del together
 
     def begin_many(self, matrices: Sequence[Float64], dtype: np.dtype[np.floating]) -> Together | None:
         """Begins to factorize up to `most` matrices in the launches of one; None if the device has too little memory.

@@ -169,8 +169,13 @@ class ServerConnection:
             sequence=self._sequence[channel + object],
         )
 
-    def topology(self, object: str, epoch: int) -> Topology:
-        """Queries the topology of an object; raises Refused if the server does not have that of this epoch."""
+    def tell(self) -> None:
+        """Says hello at once, as what it tells has changed."""
+        self._heartbeat.wake()
+
+    def topology(self, object: str, epoch: int | None = None) -> Topology:
+        """Queries the topology of an object; raises Refused if the server does not have that of this epoch. None: the
+        present one"""
         for reply in self._session.zenoh.get(key("topology", self.server, object=object), timeout=TIMEOUT):
             if reply.ok is None:
                 break

@@ -20,7 +20,7 @@ from protocol.shared_memory.pool import SlotPool
 from protocol.validate import take
 from sim_server.network.bookkeeping import Bookkeeping
 from sim_server.network.factor_decoder import FactorDecoder
-from sim_server.network.factor_intake import Decoding, FactorIntake
+from sim_server.network.factor_intake import FactorIntake
 from sim_server.network.inbox import Inbox
 from sim_server.network.job_sender import JobSender
 from sim_server.network.leases import InFlightJob, Leases
@@ -81,9 +81,18 @@ class Dispatch(FactorSource):
         }
 
     @property
-    def decoding(self) -> dict[int, Decoding]:
-        """Factors that are taken in beside the caller, by number of the job."""
-        return self._intake.decoding
+    def decoding(self) -> int:
+        """Number of factors that are taken in beside the caller. A probe for tests."""
+        return self._intake.decoded
+
+    def wake_by(self, wake: Callable[[], None]) -> None:
+        """Has `wake` called, in another thread, when a factor that is taken in beside the caller is there."""
+        self._intake.wake = wake
+
+    def makes_slots(self) -> bool:
+        """True while shared memory for arrays is being made beside the caller."""
+        with self._lock:
+            return self._pool is not None and self._pool.makes_any
 
     def announce(self, topology: Topology) -> None:
         """Begins a new epoch of an object; answers to jobs of the last one are refused."""
@@ -273,3 +282,4 @@ class Dispatch(FactorSource):
     def _on_pattern(self, sample: zenoh.Sample) -> None:
         if (new := self.decoder.add_pattern(sample.key_expr, sample.payload)) is not None:
             self._patterns = [*self._patterns, new][-MAX_NEW_PATTERNS:]
+            self._sender.prepare_for(new[1])

@@ -12,6 +12,7 @@ import zenoh
 
 from protocol.channels import PART_BYTES, WHOLE_PARTS, key
 from protocol.counters import Counters
+from protocol.factor import FactorPattern
 from protocol.messages_pb2 import MatrixBatch
 from protocol.method import Method
 from protocol.shared_memory.limits import SLOT_SHARE
@@ -218,7 +219,7 @@ class JobSender:
         if job.method.name == "incomplete_cholesky":
             nonzeros += nonzeros // SLOT_MARGIN  # the next factor may keep more blocks
         size = nonzeros * np.dtype(job.dtype).itemsize
-        if size > max(WHOLE_PARTS * PART_BYTES, self._pool.limit // SLOT_SHARE):
+        if not self._fits_slot(size):
             size = 0  # it comes in parts
         pool, sizes = self._pool, [job.values.nbytes, *([size] if size else [])]
         slots = [pool.lend(each, beside=True) for each in sizes]
@@ -226,6 +227,15 @@ class JobSender:
             self._counters.trouble("slots_exhausted", "no slot of shared memory is left, an array travels as bytes")
         matrix, factor = [*slots, None][:2]
         return matrix, factor
+
+    def _fits_slot(self, size: int) -> bool:
+        """True if a factor of so many bytes may come in a slot."""
+        return self._pool is not None and size <= max(WHOLE_PARTS * PART_BYTES, self._pool.limit // SLOT_SHARE)
+
+    def prepare_for(self, pattern: FactorPattern) -> None:
+        """Has the slot for a large factor made beside the caller, before its first job."""
+        if self._pool is not None and self._fits_slot(size := 4 * pattern.nonzeros):
+            self._pool.prepare(size)
 
     # ---- both ------------------------------------------------------------------------------------------------
 

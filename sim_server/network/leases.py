@@ -4,7 +4,8 @@
 Pure bookkeeping, without network or clock.
 """
 
-from collections.abc import Callable
+from collections import Counter
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -27,8 +28,8 @@ MAX_EXPIRED = 2  # expired jobs with which a worker still gets slots of shared m
 class SlotAllocator(Protocol):
     """The pool that slots go back to."""
 
-    def give_back(self, slot: Slot) -> None:
-        """Frees a slot."""
+    def give_back(self, slot: Slot, users: int = 1) -> None:
+        """Frees a slot that so many jobs used."""
 
 
 @dataclass(frozen=True)
@@ -124,17 +125,20 @@ class Leases:
     def cancel(self, job: InFlightJob) -> None:
         """Removes a job that was never sent."""
         del self.by_object[job.object]
-        self._drop(job)
-        self._free_slots(job)
+        self._drop([job])
+        self._free_slots([job])
 
-    def _drop(self, job: InFlightJob) -> None:
-        """Removes a job from those of its worker."""
-        jobs = self.by_worker.get(job.worker, {})
-        jobs.pop(job.number, None)
-        if self._deadlines is not None and job.deadline >= self._deadlines.get(job.worker, job.deadline):
+    def _drop(self, dropped: Sequence[InFlightJob]) -> None:
+        """Removes jobs from those of their worker."""
+        worker = dropped[0].worker
+        jobs = self.by_worker.get(worker, {})
+        for job in dropped:
+            jobs.pop(job.number, None)
+        latest = max(job.deadline for job in dropped)
+        if self._deadlines is not None and latest >= self._deadlines.get(worker, latest):
             self._deadlines = None  # the latest one may be another now
         if not jobs:
-            self.by_worker.pop(job.worker, None)
+            self.by_worker.pop(worker, None)
             self._deadlines = None
 
     def count(self, worker: str) -> int:
@@ -189,14 +193,28 @@ class Leases:
         """
         if self.by_object.get(job.object) is job:
             del self.by_object[job.object]
-        self._drop(job)
+        self._drop([job])
         self._reassigned.discard(job.number)
-        self._free_slots(job)
+        self._free_slots([job])
         self._free_expired(job.worker, job.number)
         if seconds is not None:
             self._seconds.setdefault(job.object, {})[job.worker] = seconds
             self._answered.setdefault((job.object, job.worker), set()).add((job.method, job.positions))
             self._doublings.pop((job.object, job.worker), None)
+
+    def finish_all(self, jobs: Sequence[InFlightJob], seconds: Sequence[float]) -> None:
+        """Removes jobs of one worker that it has answered with factors in one message, as `finish` does each."""
+        worker = jobs[0].worker
+        for job, lasted in zip(jobs, seconds, strict=True):
+            if self.by_object.get(job.object) is job:
+                del self.by_object[job.object]
+            self._seconds.setdefault(job.object, {})[worker] = lasted
+            self._answered.setdefault((job.object, worker), set()).add((job.method, job.positions))
+            self._doublings.pop((job.object, worker), None)
+        self._drop(jobs)
+        self._reassigned.difference_update(job.number for job in jobs)
+        self._free_slots(jobs)
+        self._free_expired(worker, max(job.number for job in jobs))
 
     def expire(self, now: float, is_answered: Callable[[InFlightJob], bool] = lambda job: False) -> list[InFlightJob]:
         """Ends the leases that are over: objects and workers are free again, the slots are not. Returns the jobs.
@@ -233,7 +251,7 @@ class Leases:
 
     def _expire(self, over: list[InFlightJob]) -> list[InFlightJob]:
         for job in over:
-            self._drop(job)
+            self._drop([job])
             self._reassigned.discard(job.number)
             pair = job.object, job.worker
             self._doublings[pair] = min(MAX_DOUBLINGS, self._doublings.get(pair, 0) + 1)
@@ -254,7 +272,7 @@ class Leases:
     def remove_worker(self, worker: str) -> list[InFlightJob]:
         """Frees all slots of a worker that left; returns its jobs that are of the present epoch of their objects."""
         for old in self._expired.pop(worker, []):
-            self._free_slots(old)
+            self._free_slots([old])
         for seconds in self._seconds.values():
             seconds.pop(worker, None)
         for known in (self._doublings, self._answered):
@@ -264,7 +282,7 @@ class Leases:
         self._deadlines = None
         for job in jobs:
             self._reassigned.discard(job.number)
-            self._free_slots(job)
+            self._free_slots([job])
         lost = [job for job in jobs if self.by_object.get(job.object) is job]
         for job in lost:
             del self.by_object[job.object]
@@ -283,9 +301,9 @@ class Leases:
         expired = self._expired.get(worker, [])
         for old in [old for old in expired if old.number <= number]:
             expired.remove(old)
-            self._free_slots(old)
+            self._free_slots([old])
 
-    def _free_slots(self, job: InFlightJob) -> None:
+    def _free_slots(self, jobs: Sequence[InFlightJob]) -> None:
         if self._allocator is not None:
-            for slot in job.slots:
-                self._allocator.give_back(slot)
+            for slot, users in Counter(slot for job in jobs for slot in job.slots).items():
+                self._allocator.give_back(slot, users)

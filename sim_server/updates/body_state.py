@@ -71,12 +71,13 @@ class JobState:
     request: number of the request for that copy, among those of all bodies; requested: when it was [s, monotonic]
     extrapolated: by how much the positions requested were extrapolated [s]
     sent: step of the last matrix that was sent; None: none was
+    checked: step of the matrix whose factor has come and is checked beside the steps; NONE: there is none
     matrix: of the job in flight: step and what was sent
     positions: the last job held positions, from which the worker assembles the matrix
     excess: of the body when the last matrix was sent: to be restored if the job fails
     """
 
-    in_flight = Cell()
+    in_flight, checked = Cell(), Cell()
 
     def __init__(self, table: UpdateTable, index: int):
         self._table, self._index = table, index
@@ -224,12 +225,19 @@ class BodyUpdateState:
         job.in_flight, job.sent, job.copy = True, step, None
         job.excess, solves.excess = solves.excess, 0.0
 
+    def on_check(self, step: int) -> None:
+        """Takes note that the factor of `step` has come and is checked beside the steps: the next matrix may be sent
+        meanwhile."""
+        self.job.checked = step
+        if step == self.job.sent:
+            self.job.in_flight = False
+
     def on_factor(self, factor: Factor, step: int) -> bool:
         """Takes note of a factor that came during `step`; False if a newer one is there already."""
         job = self.job
-        if job.in_flight and factor.step == job.sent:
+        if self._end_check(factor.step) or (job.in_flight and factor.step == job.sent):
             self.factors.latency.add(max(1, step - factor.step))
-        job.in_flight, self.failures.in_a_row = False, 0
+        job.in_flight, self.failures.in_a_row = job.in_flight and (job.sent or 0) > factor.step, 0
         if job.positions:
             self.failures.assemblies = 0
         if factor.step <= self.factors.newest:
@@ -249,16 +257,32 @@ class BodyUpdateState:
         self.job.in_flight = False
         self.solves.excess += self.job.excess
 
-    def on_failure(self, reason: str, refused: bool = False) -> None:
-        """Takes note that its job failed; it may be sent again. refused: it brought a factor that is not used."""
-        self.on_reassignment()
+    def on_failure(self, reason: str, refused: bool = False, step: int | None = None) -> bool:
+        """Takes note that a job failed; it may be sent again. Returns False if a newer one has been sent since.
+
+        refused: it brought a factor that is not used
+        step: of its matrix; None: of the one sent last
+        """
+        last = step is None or step == self.job.sent
+        if step is not None:
+            self._end_check(step)
+        if last:
+            self.on_reassignment()
         failures = self.failures
         failures.reason = reason
         failures.refused += 1
         failures.in_a_row += 1
         failures.assemblies += self.job.positions
-        if self.tuner is not None:
+        if last and self.tuner is not None:
             self.tuner.factorization.on_failure(refused)
+        return last
+
+    def _end_check(self, step: int) -> bool:
+        """True if the factor of a step was checked beside the steps, which is over now."""
+        was = bool(self.job.checked == step)
+        if was:
+            self.job.checked = NONE
+        return was
 
     def observe(self, record: Any, floor: int, cost: float) -> None:
         """Takes note of a solve (a record of the loop).
@@ -343,9 +367,12 @@ def on_factors(
     """
     row = np.array([state.body.index for state in states])
     made = np.array([factor.step for factor in factors])
-    came = table.in_flight[row] & (made == table.sent[row])
+    checked = made == table.checked[row]
+    came = checked | (table.in_flight[row] & (made == table.sent[row]))
     _add(table.latency, row[came], np.maximum(1, step - made[came]))
-    table.in_flight[row], table.failures[row] = False, 0
+    table.checked[row[checked]] = NONE
+    table.in_flight[row] &= table.sent[row] > made
+    table.failures[row] = 0
     newer = made > table.newest[row]
     taken = row[newer]
     _add(table.cost, taken, np.maximum([factor.seconds for factor in factors], MIN_SECONDS)[newer])

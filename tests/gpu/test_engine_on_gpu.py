@@ -130,7 +130,7 @@ def test_settings_and_factors_are_taken_up_while_it_runs():
     factor = factor_of(sim)
     sim.engine.records()
     sim.engine.loop.patient = 1
-    planes = sim.engine.solver.planes_for(factor.pattern, factor.values)
+    planes = sim.engine.solver.planes_of([(factor.pattern, factor.values)])[0]
     sim.engine.solver.plan(0, factor.pattern, planes)  # kernels that build inverses may be compiled for it
     records = []
     with running(sim) as thread:

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from protocol.factor import Factor, FactorPattern
-from sim_server.arrays import Float64, Int32
+from sim_server.arrays import Float64, Int32, Int64
 from sim_server.backends.base import ArrayChange, Capability, CutInput, EngineInput, Launch
 from sim_server.backends.central_difference import NODAL as NODAL_OF_SUBSTEPS
 from sim_server.backends.central_difference import CentralDifference
@@ -798,6 +798,10 @@ class CpuEngine(Reports):
     def prepare_factor(self, body: int, factor: Factor, r: Float64) -> None:
         """Returns None: a factor is applied as it comes."""
 
+    def may_prepare(self, body: int) -> bool:
+        """Returns True: nothing is prepared on a CPU."""
+        return True
+
     def drop_factor(self, body: int, factor: Factor) -> None:
         """Does nothing."""
 
@@ -807,6 +811,10 @@ class CpuEngine(Reports):
 
     def expect_factors(self, body: int, pattern: FactorPattern) -> None:
         """Does nothing: a factor is applied as it comes."""
+
+    def expects_factors(self) -> bool:
+        """Returns True."""
+        return True
 
     def resume_factor(self, body: int, pattern: FactorPattern, values: NDArray[Any], step: int) -> None:
         """Posts the factor that was in use when the state was saved; what is known of its correction holds."""
@@ -884,6 +892,14 @@ class CpuEngine(Reports):
     def matrix_step(self, body: int) -> int:
         """Step of the copy asked for last, -1 while it is not there. `step` counts the steps completed before it."""
         return int(self._body[body].snapshot_step)
+
+    def matrix_steps(self, bodies: Sequence[int]) -> Int64:
+        """The same of some bodies."""
+        return np.array([self._body[body].snapshot_step for body in bodies], np.int64)
+
+    def copy_memory(self, body: int) -> None:
+        """The loop copies to where it is told."""
+        return None
 
     def stage(self, changes: Sequence[ArrayChange]) -> list[ArrayChange]:
         """Returns the changes, which are ready."""

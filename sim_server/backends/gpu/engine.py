@@ -8,6 +8,7 @@ settings, factors and arguments.
 
 import time
 from collections.abc import Callable, Sequence
+from concurrent.futures import Future
 from functools import partial
 from typing import Any, cast
 
@@ -58,6 +59,8 @@ MOST_GRABS = 1024  # pushes and grabs at a time, of which forces are told
 MOST_TOLD = 16  # other bodies whose forces on a body are told, at most
 GRAB_BLOCKS, GRAB_THREADS = 32, 128  # of the kernel react (effects/touch.cu)
 PREPARED_WITHIN = 1.0  # s in which an inverse that is prepared for a check is begun, else the check goes without
+AT_A_TIME = 2  # factors of a body: one comes while the one before it is built
+MEMORY_AHEAD = 4 << 20, 256 << 20  # bytes of factors for which memory is taken before they come
 FEW = 16  # largest number of trials in a step without loops for which several steps are captured in one graph
 EPILOGUE = Declarations("backends/gpu/step_epilogue.cu")
 STEP_EPILOGUE = EPILOGUE.dtype("StepEpilogue")
@@ -233,6 +236,7 @@ class GpuEngine(DeviceLoop):
             self._integrate = FusedKernel(integrate, epilogue, opening=ending)
             self._stamp_begin = self._integrate.function("stamp_begin")
         self._known: Float64 = arrays["values"]  # as a factor is to know them
+        self._expected: dict[int, Future[None]] = {}  # memory for factors that will come, by pattern
         self._matrix = self._matrix_launches(assemble) if alone else ()
         self._capture()
         if given.touch is not None:
@@ -501,6 +505,10 @@ class GpuEngine(DeviceLoop):
 
         return applied
 
+    def may_prepare(self, body: int) -> bool:
+        """False while the factor before waits to be used, or steps under way still read the one that it replaced."""
+        return self._factor_upload.may_prepare(body)
+
     def drop_factor(self, body: int, factor: Factor) -> None:
         """Gives up a factor that may have been prepared, and is not posted."""
         self._factor_upload.drop(body, factor.values)
@@ -510,9 +518,22 @@ class GpuEngine(DeviceLoop):
         return pinned_array(self.gpu.cp, count, dtype)
 
     def expect_factors(self, body: int, pattern: FactorPattern) -> None:
-        """Begins to plan the inverses of factors of a pattern that will come, beside the caller."""
+        """Begins to plan the inverses of factors of a pattern that will come, and to take memory for such factors,
+        beside the caller."""
         self._factor_upload.expect(body, pattern)
+        if pattern.id not in self._expected and MEMORY_AHEAD[0] <= 4 * pattern.nonzeros <= MEMORY_AHEAD[1]:
+            self._expected[pattern.id] = self.solver.beside(partial(self._take_memory, pattern.nonzeros))
         self._patterns.note(body, pattern)
+
+    def _take_memory(self, count: int) -> None:
+        """Has page-locked memory for factors of so many values in CuPy's pool, as many as are there at a time. While it
+        is made all calls to CUDA wait."""
+        together = [self.factor_memory(count, np.dtype(np.float32)) for _ in range(AT_A_TIME)]
+        del together
+
+    def expects_factors(self) -> bool:
+        """True once the inverses of all factors that are expected are planned, and their memory is there."""
+        return self.solver.plans_made and all(each.done() for each in self._expected.values())
 
     def resume_factor(self, body: int, pattern: FactorPattern, values: NDArray[Any], step: int) -> None:
         """Posts the factor that was in use when the state was saved."""

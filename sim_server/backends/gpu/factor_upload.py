@@ -38,6 +38,7 @@ log = logging.getLogger(__name__)
 SMALL = 1 << 20  # bytes of a factor that is copied at once
 MANY = 4  # small factors that come together, from which on none is built at once
 TOGETHER = 64  # factors of one plan that are handed over together
+AHEAD = 2  # such batches beside the caller: one is built, the next is there; what waits otherwise may be replaced
 BUSY = 0.25  # share of dt that steps in real time take, up to which builds may have the whole device
 MAX_KINDS = 2  # of inverses of a body at a time; workers with different libraries send different patterns
 InverseKind = tuple[int, int]
@@ -88,8 +89,11 @@ class GivenFactor:
 
     def tell(self, applied: Applied | None) -> None:
         """Tells who waits for P^-1 r, if it is not told yet."""
-        with suppress(InvalidStateError):
-            self.applied.set_result(applied)
+        _tell(self.applied, applied)
+
+
+Work = tuple[int, GivenFactor, Mapping[InverseKind, InverseStorage | None]]
+"""A body, its factor, and by kind a storage that no step reads, if there is one."""
 
 
 class ChosenPlan(NamedTuple):
@@ -97,6 +101,7 @@ class ChosenPlan(NamedTuple):
 
     planes: float16 numbers per entry
     spare: a storage that no step reads; None: one is to be made
+    applied: P^-1 r on its way, if the factor is to be applied
     """
 
     body: int
@@ -104,6 +109,11 @@ class ChosenPlan(NamedTuple):
     planes: int
     plan: Future[PlannedInverse]
     spare: InverseStorage | None
+    applied: "Future[Applied | None]"
+
+    def tell(self, applied: Applied | None) -> None:
+        """Tells who waits for P^-1 r, if it is not told yet."""
+        _tell(self.applied, applied)
 
 
 class Builds(NamedTuple):
@@ -111,10 +121,12 @@ class Builds(NamedTuple):
 
     given: by body
     made: of each, in this order, or why there is none
+    together: they are some of many small ones
     """
 
     given: dict[int, GivenFactor]
     made: Future[list[UploadedFactor | Exception]]
+    together: bool
 
 
 @dataclass
@@ -173,7 +185,7 @@ class FactorUpload:
         planes = solver.planes or 1
         self._uploads = [BodyUploads(name, box, planes) for name, box in zip(names, mailboxes, strict=True)]
         self._lock = threading.RLock()
-        self._waiting: set[int] = set()  # bodies with a queued factor
+        self._waiting: dict[int, None] = {}  # bodies with a queued factor, those that wait longest first
         self._builds: list[Builds] = []  # under way beside the caller
         self._known: set[InverseKind] = set()  # of which storages were made
 
@@ -205,6 +217,12 @@ class FactorUpload:
             self._enqueue(body, given)
             self._begin_queued([body], beside=True)
         return given.applied
+
+    def may_prepare(self, body: int) -> bool:
+        """True if the inverse of another factor would be begun at once."""
+        with self._lock:
+            self._refresh(body)
+            return self._uploads[body].free and self._uploads[body].queued is None
 
     def drop(self, body: int, values: NDArray[Any]) -> None:
         """Gives up a factor that was prepared and not posted; any other one is let alone."""
@@ -256,11 +274,10 @@ class FactorUpload:
         with self._lock:
             waiting: dict[int, None] = {}  # in this order
             for body, pattern, values, step in given:
-                self._refresh(body)
                 if not self._use_prepared(body, values):
                     self._enqueue(body, GivenFactor(pattern, values, step))
                     waiting[body] = None
-            self._begin_queued(list(waiting))
+            self._begin_queued([*self._waiting, *(body for body in waiting if body not in self._waiting)])
 
     def advance(self) -> None:
         """Posts what was built beside the caller, and begins the builds that have waited for a storage."""
@@ -268,10 +285,7 @@ class FactorUpload:
             for builds in [each for each in self._builds if each.made.done()]:
                 self._finish(builds)
             if self._waiting:
-                waiting = sorted(self._waiting)
-                for body in waiting:
-                    self._refresh(body)
-                self._begin_queued(waiting)
+                self._begin_queued(list(self._waiting))
 
     def settle(self) -> None:
         """Waits until the next step will use the newest factors. Only while the loop stands still."""
@@ -291,7 +305,7 @@ class FactorUpload:
                     uploads.posted = uploads.mail = None
                 self._refresh(body)
                 uploads.leaving = None
-                self._begin_queued([body])
+                self._begin_queued([body], now=True)
             if uploads.building is not None:
                 return uploads.building.made
             if uploads.posted is not None:
@@ -317,68 +331,89 @@ class FactorUpload:
         if uploads.leaving is not None and self._loop.step >= uploads.leaving[1]:
             uploads.leaving = None
 
-    def _begin_queued(self, bodies: Sequence[int], beside: bool = False) -> None:
+    def _begin_queued(self, bodies: Sequence[int], beside: bool = False, now: bool = False) -> None:
         """Begins to build the queued factors of some bodies that need not wait: at once if they are few, small and
-        planned and not `beside`, else in the thread of the plans."""
+        planned and not `beside`, else in the thread of the plans, to which no more are given than it is about to build:
+        what waits here is replaced by what is newer. now: none waits for builds of other bodies"""
         small: list[int] = []
+        together = sum(builds.together for builds in self._builds)
+        room, few = TOGETHER * (AHEAD - together), now or (len(bodies) < MANY and not together)
         for body in bodies:
             uploads = self._uploads[body]
-            if uploads.queued is None or not uploads.free:
-                (self._waiting.discard if uploads.queued is None else self._waiting.add)(body)
-            elif uploads.queued.values.nbytes > SMALL or beside:
+            if uploads.queued is None:
+                self._waiting.pop(body, None)
+                continue
+            large = uploads.queued.values.nbytes > SMALL or beside
+            full = not (large or few) and len(small) >= room
+            if not full:
+                self._refresh(body)
+            if full or not uploads.free:
+                self._waiting[body] = None
+            elif large:
                 self._begin_beside([body])
-            elif len(bodies) < MANY:
+            elif few:
                 self._begin_now(body)
             else:
                 small.append(body)
         for k in range(0, len(small), TOGETHER):
-            self._begin_beside(small[k : k + TOGETHER])
+            self._begin_beside(small[k : k + TOGETHER], together=True)
 
-    def _take_queued(self, body: int) -> tuple[int, GivenFactor, Mapping[InverseKind, InverseStorage | None]]:
+    def _take_queued(self, body: int) -> Work:
         """Takes the queued factor of a body, with the storages that no step reads."""
         uploads = self._uploads[body]
         given, uploads.queued = uploads.queued, None
         assert given is not None
-        self._waiting.discard(body)
+        self._waiting.pop(body, None)
         used = uploads.in_use.storage if uploads.in_use else None
         spare = {kind: next((s for s in made if s is not used), None) for kind, made in uploads.storages.items()}
         return body, given, spare
 
     def _begin_now(self, body: int) -> None:
-        chosen = self._chosen(*self._take_queued(body))
-        if chosen.plan.done():
-            self._post(body, chosen.given, self._build([chosen])[0])
+        work = self._take_queued(body)
+        chosen = self._chosen([work])
+        if chosen[0].plan.done():
+            self._post(body, chosen[0].given, self._build(chosen)[0])
         else:
-            builds = self._note([chosen.given], [body])
-            self._solver.beside(partial(self._end, [chosen], builds.made))
+            builds = self._note([work[1]], [body])
+            self._solver.beside(partial(self._end, chosen, builds.made))
 
-    def _begin_beside(self, bodies: Sequence[int]) -> None:
+    def _begin_beside(self, bodies: Sequence[int], together: bool = False) -> None:
         work = [self._take_queued(body) for body in bodies]
-        builds = self._note([given for _, given, _ in work], bodies)
+        builds = self._note([given for _, given, _ in work], bodies, together)
         self._solver.beside(partial(self._choose_and_build, work, builds.made))
 
-    def _note(self, given: Sequence[GivenFactor], bodies: Sequence[int]) -> Builds:
-        builds = Builds(dict(zip(bodies, given, strict=True)), Future())
+    def _note(self, given: Sequence[GivenFactor], bodies: Sequence[int], together: bool = False) -> Builds:
+        builds = Builds(dict(zip(bodies, given, strict=True)), Future(), together)
         for body in bodies:
             self._uploads[body].building = builds
         self._builds.append(builds)
         return builds
 
-    def _chosen(
-        self, body: int, given: GivenFactor, spare: Mapping[InverseKind, InverseStorage | None]
-    ) -> ChosenPlan:  # fmt: skip
-        """Chooses how many digits an inverse needs, and begins its plan."""
-        planes = self._solver.planes_for(given.pattern, given.values)
-        plan = self._solver.begin_plan(body, given.pattern, planes)
-        return ChosenPlan(body, given, planes, plan, spare.get((given.pattern.id, planes)))
+    def _chosen(self, work: Sequence[Work], planes: int = 0) -> list[ChosenPlan]:
+        """Chooses how many digits each of some inverses needs, and begins its plan. planes: as many as these; 0: not
+        known yet"""
+        own = [planes] * len(work) if planes else self._planes_of([given for _, given, _ in work])
+        chosen = []
+        for (body, given, spare), needed in zip(work, own, strict=True):
+            plan = self._solver.begin_plan(body, given.pattern, needed)
+            spare_one = spare.get((given.pattern.id, needed))
+            chosen.append(ChosenPlan(body, given, needed, plan, spare_one, given.applied))
+        return chosen
 
-    def _choose_and_build(
-        self, work: Sequence[tuple[int, GivenFactor, Mapping[InverseKind, InverseStorage | None]]],
-        made: Future[list[UploadedFactor | Exception]],
-    ) -> None:  # fmt: skip
+    def _planes_of(self, given: Sequence[GivenFactor]) -> list[int]:
+        """Returns the float16 numbers per entry that the inverse of each of some factors needs."""
+        return self._solver.planes_of([(each.pattern, each.values) for each in given])
+
+    def _choose_and_build(self, work: Sequence[Work], made: Future[list[UploadedFactor | Exception]]) -> None:
         """Begins to build inverses, in the thread of the plans: now, or behind their plans."""
+        planes = 0
         try:
-            chosen = [self._chosen(*each) for each in work]
+            if len(work) == 1 and self._solver.planes is None:
+                planes, built = self._built_ahead(*work[0])
+                if built is not None:
+                    made.set_result([built])
+                    return
+            chosen = self._chosen(work, planes)
         except Exception as error:
             for _, given, _ in work:
                 given.tell(None)
@@ -388,6 +423,24 @@ class FactorUpload:
             self._end(chosen, made)
         else:
             self._solver.beside(partial(self._end, chosen, made))
+
+    def _built_ahead(
+        self, body: int, given: GivenFactor, spare: Mapping[InverseKind, InverseStorage | None]
+    ) -> tuple[int, UploadedFactor | Exception | None]:  # fmt: skip
+        """Begins to build an inverse with as many digits as the one before had, and finds out meanwhile how many it
+        needs. Returns the float16 numbers per entry that it needs, and what is made; None: it needs others."""
+        expected = self._uploads[body].planes
+        plan, applied, built = self._solver.begin_plan(body, given.pattern, expected), Future[Applied | None](), None
+        if plan.done():
+            spare_one = spare.get((given.pattern.id, expected))
+            built = self._build([ChosenPlan(body, given, expected, plan, spare_one, applied)])[0]
+        planes = self._planes_of([given])[0]
+        if built is not None and planes == expected:
+            given.tell(applied.result())
+            return planes, built
+        if isinstance(built, UploadedFactor):
+            built.inverse.event.synchronize()  # the device writes into memory that nobody keeps
+        return planes, None
 
     def _end(self, chosen: Sequence[ChosenPlan], made: Future[list[UploadedFactor | Exception]]) -> None:
         try:
@@ -409,7 +462,7 @@ class FactorUpload:
                             made[place] = error
         finally:
             for each in chosen:
-                each.given.tell(None)
+                each.tell(None)
         return made
 
     def _build_by(
@@ -444,7 +497,7 @@ class FactorUpload:
         if chosen.given.r is None or chosen.given.dropped:  # dropped: nobody would keep the memory that it comes to
             return
         try:
-            chosen.given.tell(builder.apply(inverse, chosen.given.r, self._multiprocessors))
+            chosen.tell(builder.apply(inverse, chosen.given.r, self._multiprocessors))
         except Exception as error:
             log.warning("object %r: a factor is not applied for its check: %s", self._uploads[chosen.body].name, error)
 
@@ -532,3 +585,8 @@ class FactorUpload:
             log.warning(
                 "object %r: a factor cannot be used on the GPU: %s; it goes on with %s", uploads.name, reason, held
             )
+
+
+def _tell(waiting: "Future[Applied | None]", applied: Applied | None) -> None:
+    with suppress(InvalidStateError):
+        waiting.set_result(applied)

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Arrays in page-locked host memory, which the device reads by itself, beside other work."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -27,3 +28,24 @@ def pinned_array(cp: Any, count: int, dtype: np.dtype[Any]) -> NDArray[Any]:
         return np.empty(count, dtype)
     array: NDArray[Any] = np.frombuffer(memory, dtype, count).view(PinnedArray)
     return array
+
+
+def is_pinned(array: NDArray[Any]) -> bool:
+    """True if the device can read an array, all of it together, by itself."""
+    return isinstance(array, PinnedArray) and array.flags.c_contiguous
+
+
+def runs(arrays: Sequence[NDArray[Any]]) -> list[tuple[int, int, int]]:
+    """Returns the copies that put arrays one behind the other, one for arrays that lie so already: first byte of the
+    target, address of the source, bytes."""
+    found: list[tuple[int, int, int]] = []
+    begin = 0
+    for each in arrays:
+        address, size = int(each.__array_interface__["data"][0]), each.nbytes
+        if found and found[-1][1] + found[-1][2] == address:
+            first, source, length = found[-1]
+            found[-1] = first, source, length + size
+        else:
+            found.append((begin, address, size))
+        begin += size
+    return found

@@ -22,7 +22,7 @@ from sim_server.backends.gpu.helper import LEAST_NODES, FarVectors, Helper
 from sim_server.backends.gpu.inverse.build_inverse import InverseBuilder, PartitionedInverse, builder_kernels
 from sim_server.backends.gpu.inverse.device_plan import DevicePlan, shared_bytes
 from sim_server.backends.gpu.inverse.digits import library as digits_library
-from sim_server.backends.gpu.inverse.digits import planes_for
+from sim_server.backends.gpu.inverse.digits import planes_of
 from sim_server.backends.gpu.inverse.plan import plan
 from sim_server.backends.gpu.row_partition import SPARED, best_assignment, halo, initial_ranges, lists_of
 from sim_server.backends.gpu.structs import CONTACT, CORRECTION, PCG, PCG_RESULT, STAGES
@@ -284,9 +284,9 @@ class PcgSolver:
         """Has the kernels that build inverses compiled beside the caller, before a factor waits for them."""
         self.beside(lambda: builder_kernels(self.gpu))
 
-    def planes_for(self, pattern: FactorPattern, values: NDArray[Any]) -> int:
-        """Returns the float16 numbers per entry that the inverse of a factor gets. From any thread."""
-        return planes_for(pattern, values) if self.planes is None else self.planes
+    def planes_of(self, factors: Sequence[tuple[FactorPattern, NDArray[Any]]]) -> list[int]:
+        """Returns the float16 numbers per entry that the inverse of each of some factors gets. From any thread."""
+        return planes_of(factors) if self.planes is None else [self.planes] * len(factors)
 
     def beside(self, work: Callable[[], T]) -> Future[T]:
         """Has work done in the thread of the plans, one after another."""
@@ -310,6 +310,12 @@ class PcgSolver:
             made = self._plans[key] = self.beside(lambda: self._planned(pattern, blocks, planes))
         made.add_done_callback(partial(self._forget_failed, key))
         return made
+
+    @property
+    def plans_made(self) -> bool:
+        """True if no plan is being made."""
+        with self._lock:
+            return all(made.done() for made in self._plans.values())
 
     def _forget_failed(self, key: tuple[int, int, int], made: Future[PlannedInverse]) -> None:
         """Has a plan that could not be made tried again the next time: memory may be free then."""

@@ -33,6 +33,7 @@ class Async(UpdatePolicy):
     """Matrices of the most urgent bodies go to idle workers, one of a body at a time."""
 
     free = True
+    goes_ahead = True  # the next matrix of a body is sent while its last factor is checked, if there is room
 
     def __init__(self, driver: Driver, n: int = 0):
         super().__init__(driver, n)
@@ -83,10 +84,14 @@ class Async(UpdatePolicy):
         if places <= 0 or step == self._exhausted:
             return
         # Choose the most urgent bodies, and leave the first of them to faster workers that are busy
-        requests = self._requests()
-        requests = requests.of(self.wants(requests, step))
-        left, interval = source.faster_busy_workers(), solver.update_floor_steps
-        chosen = pick(requests, left + places, interval, solver.schedule, self._overdue(source.worker_count()))[left:]
+        left, overdue = source.faster_busy_workers(), self._overdue(source.worker_count())
+        chosen: list[int] = []
+        for ahead in (False, True) if self.goes_ahead else (False,):
+            if room := left + places - len(chosen):
+                requests = self._requests(ahead)
+                requests = requests.of(self.wants(requests, step))
+                chosen += pick(requests, room, solver.update_floor_steps, solver.schedule, overdue)
+        chosen = chosen[left:]
         # Request their matrices; in advance only those of bodies that need a factor
         states = [driver.bodies[body] for body in chosen]
         wanted = states[:idle] + [s for s in states[idle:] if s.job.sent is None or s.solves.excess > 0]
@@ -110,9 +115,9 @@ class Async(UpdatePolicy):
         """Takes note that there is a body again whose matrix may be requested."""
         self._exhausted = -1
 
-    def _requests(self) -> UpdateRequests:
-        """Returns the requests of all bodies but frozen ones and those that are better left for a busy worker."""
-        requests, source = self.driver.requests(), self.driver.source
+    def _requests(self, ahead: bool) -> UpdateRequests:
+        """Returns the requests (Driver.requests) of bodies, without those that are better left for a busy worker."""
+        requests, source = self.driver.requests(ahead), self.driver.source
         failures = source.consecutive_failures()
         if failures is None:
             return requests
@@ -127,15 +132,14 @@ class Async(UpdatePolicy):
         """Sends copies to idle workers in the order of the requests. With a prefetch depth others wait their turn."""
         driver = self.driver
         copied = driver.snapshots.completed()
-        if copied and copied[-1].job.request > self._newest_copy:
-            self._newest_copy = copied[-1].job.request
-            self.prefetch.on_copy(time.monotonic() - copied[-1].job.requested)
-        idle = driver.source.ready() if copied else 0
+        if copied and (newest := copied[-1][0].job).request > self._newest_copy:
+            self._newest_copy = newest.request
+            self.prefetch.on_copy(time.monotonic() - newest.requested)
+        idle, now = driver.source.ready() if copied else 0, driver.engine.step
         made: list[tuple[BodyUpdateState, Job]] = []
-        for state in copied:
-            waited = driver.engine.step - driver.snapshots.step(state)
+        for state, step in copied:
             if idle <= len(made) and self.prefetch.depth:
-                if waited > self.prefetch.patience:
+                if now - step > self.prefetch.patience:
                     driver.snapshots.discard(state)
                 continue
             if (job := driver.make_job(state)) is not None:
@@ -165,6 +169,8 @@ class Async(UpdatePolicy):
 
 class Adaptive(Async):
     """As Async, but a matrix is sent only once the excess iterations have cost as much as a factorization."""
+
+    goes_ahead = False  # what was lost is lost to the factor that is about to be replaced
 
     def wants(self, requests: UpdateRequests, step: int) -> Flags:
         """True where a new factor is worth its time (scheduler.is_worthwhile)."""

@@ -32,35 +32,42 @@ Row = dict[str, Any]
 def measure(
     tets: int, first: str = "go", device: str = "gpu", worker: str = "gpu", seconds: float = 10.0, dt: float = 0.03
 ) -> Row:  # fmt: skip
-    """Runs a server for some seconds after its first answer, in real time.
+    """Runs a server for some seconds after its first answer, in real time; at least half of them with a factor.
 
     first: solver.first_factor. Returns: steps and seconds until a step used a factor; of the status queries the number,
     how many failed, and the longest [ms]; of the factors in the last half their number a second, mean age [steps] and
     time from the step of the matrix to the first step that uses it [ms]; times of the steps in that half [ms]
     """
     with tempfile.TemporaryDirectory() as folder:
-        scene, endpoint = Problem(tets, dt=dt).write(Path(folder)), free_endpoint()
-        server = subprocess.Popen(
-            [sys.executable, "-m", "sim_server", str(scene), "--device", device, "--realtime", "--workers", "1",
-             "--worker-device", worker, "--listen", endpoint, "--set", f"solver.first_factor={first}"],
-            stdout=sys.stderr,
-        )  # fmt: skip
-        try:
-            return {"tets": tets, "worker": worker, "dt": dt, "first factor": first, **_watched(endpoint, seconds, dt)}
-        finally:
-            server.terminate()
-            server.wait(30)
+        scene = Problem(tets, dt=dt).write(Path(folder))
+        row = served(scene, first, device, worker, seconds, dt)
+    return {"tets": tets, "worker": worker, "dt": dt, "first factor": first, **row}
+
+
+def served(scene: Path, first: str, device: str, worker: str, seconds: float, dt: float) -> Row:
+    """The same for a scene of one body in a file. first: "" for servers that know no other than to go."""
+    endpoint, chosen = free_endpoint(), ["--set", f"solver.first_factor={first}"] if first else []
+    server = subprocess.Popen(
+        [sys.executable, "-m", "sim_server", str(scene), "--device", device, "--realtime", "--workers", "1",
+         "--worker-device", worker, "--listen", endpoint, *chosen],
+        stdout=sys.stderr,
+    )  # fmt: skip
+    try:
+        return _watched(endpoint, seconds, dt)
+    finally:
+        server.terminate()
+        server.wait(30)
 
 
 def _watched(endpoint: str, seconds: float, dt: float) -> Row:
-    client = _client(endpoint)
+    client = client_of(endpoint)
     with client:
-        _answering(client)
+        answering(client)
         begun, used, waits, failed = time.monotonic(), None, [], 0
         half = begun + seconds / 2
         subscribed, steps = client.steps(), list[pb.ObjectStep]()
         step_of_use = -1
-        while (now := time.monotonic()) < begun + seconds or (used is None and now < begun + PATIENCE):
+        while (now := time.monotonic()) < begun + (PATIENCE if used is None else max(seconds, used + seconds / 2)):
             try:
                 client.command("status")
                 status = client.status()
@@ -99,7 +106,7 @@ def _of_steps(steps: Sequence[pb.ObjectStep], dt: float) -> Row:
     }  # fmt: skip
 
 
-def _answering(client: Client) -> None:
+def answering(client: Client) -> None:
     """Waits until the server answers commands: until then it has not begun."""
     end = time.monotonic() + PATIENCE
     while True:
@@ -111,7 +118,8 @@ def _answering(client: Client) -> None:
                 raise
 
 
-def _client(endpoint: str) -> Client:
+def client_of(endpoint: str) -> Client:
+    """Connects to a server that may still be starting."""
     end = time.monotonic() + PATIENCE
     while True:
         try:

@@ -31,7 +31,7 @@ from sim_server.backends.gpu.inverse.expansion_batches import (
 from sim_server.backends.gpu.inverse.partition import COLUMNS, ROWS
 from sim_server.backends.gpu.inverse.plan import Plan
 from sim_server.backends.gpu.inverse.workspace import workspace
-from sim_server.backends.gpu.pinned import PinnedArray
+from sim_server.backends.gpu.pinned import is_pinned, runs
 
 HEAD = BUILDS.itemsize  # bytes in front of the values: struct Builds
 COUNTS = (1, 4, 16, MOST_BUILDS)  # of inverses, for which graphs are made
@@ -160,18 +160,18 @@ class InverseBuilder:
         head["count"] = count
         targets = [(s.matrix.data.ptr, s.scale.data.ptr) for s in storages]
         head["targets"][:count] = np.array(targets, np.uint64).view(INVERSE_STORAGE).ravel()
-        size, first = HEAD + 4 * count * self._nonzeros, values[0]
+        size = HEAD + 4 * count * self._nonzeros
         graph, stream = self._graph(multiprocessors, next(c for c in COUNTS if c >= count)), space.stream
         at, copy, kind = int(space.incoming.data.ptr), cp.cuda.runtime.memcpyAsync, cp.cuda.runtime.memcpyHostToDevice
-        pinned = isinstance(first, PinnedArray) and first.dtype == np.float32 and first.flags.c_contiguous
-        if count == 1 and pinned:
+        if all(each.dtype == np.float32 and is_pinned(each) for each in values):
             copy(at, space.staging.ctypes.data, HEAD, kind, stream.ptr)
-            copy(at + HEAD, first.ctypes.data, size - HEAD, kind, stream.ptr)
+            for begin, source, length in runs(values):
+                copy(at + HEAD + begin, source, length, kind, stream.ptr)
         else:
             for row, factor in zip(space.staging[HEAD:size].view(np.float32).reshape(count, -1), values, strict=True):
                 np.copyto(row, factor, casting="same_kind")
             copy(at, space.staging.ctypes.data, size, kind, stream.ptr)
-        space.copied, space.source = stream.record(), first
+        space.copied, space.source = stream.record(), list(values)
         graph.launch(stream)
         for each in storages:
             if self._helper and each.far:
