@@ -19,20 +19,31 @@ struct HelperMemory {
     PcgBody body;
     DevicePlan plan;
     PartitionedInverse inverse;
-    unsigned command[COMMAND_WORDS];
+    unsigned command[COMMAND_WORDS], sequence;
     double scratch[WARPS];
 };
 __shared__ HelperMemory memory;
 
-// Waits for the command with this number.
-__device__ __forceinline__ Command next_command(const FlagWord<float>* words, unsigned sequence) {
+// Waits for a command of this launch after `last`, and sets `last` to its number. The solver waits for the answers to an application before
+// it goes on, so that only commands without one are passed over: they have nothing that later ones do not tell.
+__device__ __forceinline__ Command next_command(const FlagWord<float>* words, unsigned base, unsigned& last) {
     __syncthreads();  // the last one has been read
-    if (threadIdx.x < COMMAND_WORDS) {
-        float v;
-        for (unsigned spins = 0; keep_polling(!words[threadIdx.x].get(v, sequence), spins);) {}
-        memory.command[threadIdx.x] = __float_as_uint(v);
+    if (threadIdx.x < 32) {
+        const int k = threadIdx.x % COMMAND_WORDS;
+        FlagWord<float> word;
+        unsigned sequence;
+        bool whole;
+        unsigned spins = 0;
+        do {
+            word = words[k].load();
+            sequence = (unsigned)(word.bits >> 32);
+            whole = sequence == __shfl_sync(ALL, sequence, 0) && sequence != last && sequence - base - 1 < MOST_COMMANDS;
+        } while (keep_polling(!__all_sync(ALL, whole), spins));
+        if (threadIdx.x < COMMAND_WORDS) memory.command[k] = (unsigned)word.bits;
+        if (threadIdx.x == 0) memory.sequence = sequence;
     }
     __syncthreads();
+    last = memory.sequence;
     const unsigned* w = memory.command;
     return {(int)w[0], w[1], w[2], w[3], (int)w[4], (int)w[5], __uint_as_float(w[6]), __uint_as_float(w[7])};
 }
@@ -94,9 +105,10 @@ extern "C" __global__ void __launch_bounds__(THREADS, 1) help(const HelperArgume
     if (range < 0) return;
     const RowRange own = h.row_ranges[range];
     const FlagWord<float>* commands = h.commands + COMMAND_WORDS * own.body;
-    unsigned sequence = SEQUENCE * *h.launches;
+    const unsigned base = SEQUENCE * *h.launches;
+    unsigned last = base;
     for (int row = 0;;) {
-        const Command c = next_command(commands, ++sequence);
+        const Command c = next_command(commands, base, last);
         if (c.row == 0) break;
         if (c.row != row) {
             row = c.row;

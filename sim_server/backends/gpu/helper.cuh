@@ -13,7 +13,8 @@ constexpr int COMMAND_WORDS = 8;
 constexpr int NEAR_READS = 16777216, FAR_READS = 33554432;
 constexpr int FORMED_FAR = 4;
 constexpr int RESIDUAL_FAR = 1073741824;
-constexpr unsigned SEQUENCE = 0x9e3779b9u;  // commands of launch k have the numbers SEQUENCE k + 1, + 2, ...: none of the launch before
+constexpr unsigned SEQUENCE = 0x9e3779b9u;     // commands of launch k have the numbers SEQUENCE k + 1, + 2, ...
+constexpr unsigned MOST_COMMANDS = 0x1000000u;  // of a launch, so that none of the launch before is taken for one of this
 
 struct Help {  // of all bodies, argument of pcg.cu
     const long long* far;              // (rows,) by PcgBody.helper: bytes from a word of the body's vectors to the helper's copy

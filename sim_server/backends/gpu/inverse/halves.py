@@ -77,16 +77,17 @@ class FarFlags:
 
     def segments(self, segments: NDArray[np.int32]) -> NDArray[np.int32]:
         """Returns FORMED_FAR for each of the segments, (k, 4) of WarpSegment, whose entries the other reads."""
-        whole = self._other.read.reshape(-1, COLUMNS).any(axis=1)
-        forms = segments[:, 0] == FORM
+        whole: Flags = np.logical_or.reduce(self._other.read.reshape(-1, COLUMNS), axis=1)
+        forms: Flags = segments[:, 0] == FORM
         return np.where(forms & whole[np.where(forms, segments[:, 1], 0) // COLUMNS], FORMED_FAR, 0).astype(np.int32)
 
     def tiles(self, tiles: NDArray[np.int32], phase: NDArray[np.int64]) -> NDArray[np.int32]:
         """Returns 1 for each of the tiles, (k, 8), with results that the other reads. phase: of each tile"""
-        whole = self._other.solved.reshape(-1, ROWS).any(axis=1)
-        solves = phase >= self._plan.groups - 1
+        whole: Flags = np.logical_or.reduce(self._other.solved.reshape(-1, ROWS), axis=1)
+        solves: Flags = phase >= self._plan.groups - 1
         out = np.where(solves, tiles[:, 3], 0) // ROWS
-        return (solves & (whole[out] | whole[out + (tiles[:, 4] > ROWS)])).astype(np.int32)
+        found: Flags = solves & (whole[out] | whole[out + (tiles[:, 4] > ROWS)])
+        return found.astype(np.int32)
 
     def places(self) -> NDArray[np.int32]:
         """Returns RESIDUAL_FAR for each node whose residual the other reads, (nodes,)."""
