@@ -6,6 +6,7 @@ import pytest
 
 from precond_worker.factorization.factorize import Analysis
 from sim_server.backends.gpu import solver
+from sim_server.errors import DeviceError, InputError
 from sim_server.simulation import Simulation
 from tests.backends import fake_cupy
 from tests.support import nvrtc
@@ -41,3 +42,36 @@ def test_a_step_launches_the_helper_and_dismisses_it(cupy):
         assert row["helper"] > 0 and row["factor_step"] == step
     made = engine.solver.begin_plan(body.index, analysis.pattern).result()
     assert made.plan.plan.blocks == 2 * row["blocks"]
+
+
+@pytest.mark.parametrize(
+    ("overrides", "words"),
+    [
+        (["integrator.scheme=ros2"], "with scheme ros2"),
+        (["integrator.scheme=central_difference"], "with explicit steps"),
+        (["object.beam.effects.cutting={ spare = 50 }"], "with bodies that may be split"),
+    ],
+)
+def test_scenes_that_two_gpus_do_not_solve_are_refused(overrides, words):
+    with pytest.raises(InputError, match=f"solver.gpus = 2 {words}: allowed is 1"):
+        Simulation.load("deploy/scenes/beam.toml", ["solver.gpus=2", *overrides], "gpu")
+
+
+def test_small_bodies_are_refused(monkeypatch):
+    monkeypatch.setattr(solver, "LEAST_NODES", 100_000)
+    with pytest.raises(InputError, match=r"solver.gpus = 2: the largest object has \d+ nodes.* allowed is 1"):
+        Simulation.load("deploy/scenes/beam.toml", ["solver.gpus=2"], "gpu")
+
+
+def test_without_a_second_gpu_or_peer_access_a_line_says_so(cupy, monkeypatch):
+    monkeypatch.setattr(cupy.cuda.runtime, "deviceCanAccessPeer", lambda a, b: int(a == 0))
+    with pytest.raises(DeviceError, match=r"solver.gpus = 2: GPU 1 cannot access the memory of GPU 0"):
+        Simulation.load("deploy/scenes/beam.toml", ["solver.gpus=2"], "gpu")
+    monkeypatch.setattr(cupy.cuda.runtime, "getDeviceCount", lambda: 1)
+    with pytest.raises(DeviceError, match=r"solver.gpus = 2: no second GPU; CUDA shows 1 \(CUDA_VISIBLE_DEVICES\)"):
+        Simulation.load("deploy/scenes/beam.toml", ["solver.gpus=2"], "gpu")
+
+
+def test_a_cpu_has_one():
+    with pytest.raises(InputError, match=r"solver.gpus = 2: must be one of 1 on a CPU"):
+        Simulation.load("deploy/scenes/beam.toml", ["solver.gpus=2"], "cpu")

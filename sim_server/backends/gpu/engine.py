@@ -95,6 +95,7 @@ class GpuEngine(DeviceLoop):
     capabilities: frozenset[Capability] = frozenset()
 
     def __init__(self, gpu: Gpu, given: EngineInput, records: int | None = None):
+        self._helper = Helper.wanted(gpu, given)
         assemble, integrate = (cast(Sequence[DeviceLaunch], part) for part in (given.assemble, given.integrate))
         self.launches, self._first = [*assemble, *integrate], assemble[: leading(assemble)]
         self._history = cast(Sequence[DeviceLaunch], given.history)
@@ -135,7 +136,6 @@ class GpuEngine(DeviceLoop):
             (given.contact.corner, given.contact.weight) if given.contact and surfaces else ()
         )
         self._prepared = False
-        self._helper = Helper.wanted(gpu, given)
         self.solver = PcgSolver(
             gpu, ranges, arrays, self._counter, CAPACITY, planes,
             phases.of_solves(errors) if phases else (), ATTEMPTS if stages else 0,
