@@ -56,7 +56,7 @@ def _summary(status: pb.Status) -> Text:
         f"late {status.late_steps}; dropped: frames {status.frames_dropped}, step records {status.records_dropped}; "
         f"lost to the log {status.records_lost}, left out of it {status.records_thinned}",
         f"refused: messages {status.refused}, commands {status.commands_refused}; "
-        f"arrays through shared memory {status.bulk_shared}, "
+        f"arrays through shared memory {status.bulk_shared}{_on_device(status)}, "
         f"as bytes {status.bulk_copied}; clients {len(status.clients)}",
     ]
     if status.recording_failure:
@@ -160,13 +160,18 @@ def _energies(status: pb.Status) -> list[Table]:
     return [table] if shown else []
 
 
+def _on_device(status: pb.Status) -> str:
+    """How many of them stayed in memory of a GPU, if any did."""
+    return f" ({status.bulk_on_device} of them on the device)" if status.bulk_on_device else ""
+
+
 def _workers(status: pb.Status) -> Table | Text:
     if not status.workers:
         return Text("no workers")
     table = Table("worker", "host", "pid", "library", "threads", "jobs", "failed", "refused", "shm", **COMPACT)
     for worker in status.workers:
         numbers = (worker.threads, worker.jobs, worker.failures, worker.refused)
-        shared = "yes" if worker.shared_memory else "no"
+        shared = "device" if worker.device_memory else "yes" if worker.shared_memory else "no"
         _add(table, worker.worker, worker.host, str(worker.pid), worker.library, *map(str, numbers), shared)
     return table
 

@@ -12,7 +12,7 @@ import zenoh
 from numpy.typing import NDArray
 
 from precond_worker.arrays import Float64, Int64
-from precond_worker.native_copies import native_copies
+from precond_worker.network.native_copies import native_copies
 from protocol.channels import CHANNELS, MOST_JOBS
 from protocol.factor import FactorPattern
 from protocol.messages_pb2 import FactorBatch, Header, Matrix, MatrixBatch

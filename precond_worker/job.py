@@ -62,6 +62,11 @@ class Job:
         return self.alone is not None and self.alone.nodes > 0
 
     @property
+    def on_device(self) -> bool:
+        """True if the matrix lies in device memory of the server."""
+        return self.alone is not None and self.alone.HasField("device_matrix")
+
+    @property
     def shape(self) -> tuple[int, ...]:
         """Shape of the values."""
         return (self.message.nodes, 3) if self.positions else (self.message.blocks, 3, 3)
@@ -96,7 +101,8 @@ def accept(sample: zenoh.Sample, server: str, worker: str, incarnation: int) -> 
     check_name(header.object, "Matrix.header.object")
     if header.object != name_in("matrix", sample.key_expr, "object") or message.worker != worker:
         raise Refused(f"Matrix is for {message.worker!r}, its key is {sample.key_expr}", "worker")
-    shared = message.HasField("matrix_slot") and sample.payload.as_shm() is not None
+    in_slot = message.HasField("matrix_slot") and sample.payload.as_shm() is not None
+    shared = in_slot or message.HasField("device_matrix")
     told = header.object, header.epoch, header.sequence, message.blocks, message.factor_dtype, message.topology
     return [Job(*told, message.known_patterns, sample.payload, shared, _method(message), message)]
 

@@ -16,12 +16,12 @@ from numpy.typing import NDArray
 from precond_worker.arrays import Float64, Int32
 from precond_worker.batch import Batch, BatchAnswer
 from precond_worker.errors import DeviceUnusable, NameTaken
-from precond_worker.factorization.registry import Factorization
+from precond_worker.factorization.registry import DeviceFactorization, Factorization
 from precond_worker.job import Job, accept
 from precond_worker.network.presence import ServerGone, ServersThere
 from precond_worker.network.server_connection import ServerConnection
-from precond_worker.preparation import LEAST_NODES, objects_to_prepare
 from precond_worker.remote_assembly import Assemblers
+from precond_worker.symbolic.preparation import LEAST_NODES, objects_to_prepare
 from protocol.channels import WHOLE_PARTS
 from protocol.factor import FactorPattern
 from protocol.messages_pb2 import Factor, Topology
@@ -171,12 +171,14 @@ class Worker:
         """Takes the job that waits longest, and others that can be factorized together with it."""
         first = self._pending.pop(next(iter(self._pending)))
         shared = self._known_analysis(first)
-        most = getattr(shared, "most", 1) if self._pending else 1
+        most: int = getattr(shared, "most", 1)
+        if shared is not None:
+            self._connection.together = most
         jobs = [first]
         for name, job in list(self._pending.items()):
             if len(jobs) >= most:
                 break
-            alike = job.dtype == first.dtype and not (job.positions or first.positions)
+            alike = job.dtype == first.dtype and not any(j.positions or j.on_device for j in (job, first))
             if alike and self._known_analysis(job) is shared:
                 jobs.append(self._pending.pop(name))
         return jobs
@@ -360,7 +362,12 @@ class Worker:
     def _factorize(self, job: Job) -> None:
         message = job.message
         analysis = self._analysis(job)
-        values = job.values(self._connection.slots)
+        if job.on_device:
+            values = self._factorize_on_device(job, analysis)
+            if values is None:
+                return
+        else:
+            values = job.values(self._connection.slots)
         assembler = self._assemblers.of(job.object, message.header.epoch) if job.positions else None
         complete = job.method.name == COMPLETE  # its pattern is known beforehand
         if complete:  # so that the server can prepare for it meanwhile
@@ -375,6 +382,34 @@ class Worker:
         if not complete:
             self._send_pattern(job, analysis.pattern)
         self._answer(job, analysis.pattern, factor, seconds, remedy=analysis.remedy)
+
+    def _factorize_on_device(self, job: Job, analysis: Factorization) -> Float64 | None:
+        """Factorizes a matrix in device memory of the server, where L is written, too, and answers. Returns the matrix
+        if that must be done on the host: it may need a remedy."""
+        message, device, connection = job.message, self._connection.device, self._connection
+        dtype, size = np.dtype(message.factor_dtype), 72 * message.blocks
+        try:
+            if device is None:
+                raise Refused("Matrix.device_matrix is set, but this worker opens no device memory", "slot")
+            matrix = device.address(message.device_matrix, size)
+            room = message.device_factor.capacity
+            target = device.address(message.device_factor, min(room, analysis.pattern.nonzeros * dtype.itemsize))
+        except Refused as refusal:
+            connection.leave_device(str(refusal))
+            raise
+        self._send_pattern(job, analysis.pattern)
+        begin, copy = time.perf_counter(), None
+        if analysis.pattern.nonzeros * dtype.itemsize <= room and isinstance(analysis, DeviceFactorization):
+            copy = analysis.factorize_on_device(matrix, dtype)
+        if copy is None:
+            return device.read(matrix, np.dtype(np.float64), size // 8).reshape(job.shape)
+        seconds = time.perf_counter() - begin
+        self._on_factorization(seconds)
+        if not device.is_current(message.device_factor):
+            raise Refused("the slot for the factor was lent to somebody else: this answer is late", "late")
+        copy(target)
+        self._answer(job, analysis.pattern, None, seconds)
+        return None
 
     def _send_pattern(self, job: Job, pattern: FactorPattern) -> None:
         """Sends the pattern of L if the server does not know it."""
@@ -446,8 +481,11 @@ class Worker:
             matrix_shared=job.shared,
         )
         payload = b""
-        if pattern is not None and values is not None:
+        if pattern is not None:
             answer.pattern, answer.nonzeros = pattern.id, pattern.nonzeros
+        if pattern is not None and values is None:  # they are in the slot already
+            answer.device_slot.CopyFrom(message.device_factor)
+        elif pattern is not None and values is not None:
             if self._into_slot(message, answer, values):
                 pass
             elif 0 < WHOLE_PARTS * message.part_bytes < values.nbytes:
@@ -457,7 +495,7 @@ class Worker:
                 answer.checksum = checksum(values)
                 payload = values.tobytes()
         connection.send_factor(answer, payload)
-        if values is not None:
+        if pattern is not None:
             self._counters.add("factors")
 
     def _answers_to(self, batch: Batch) -> BatchAnswer:

@@ -181,6 +181,11 @@ class Factor:
     later: bool = False
     method: str = ""
 
+    def checksum(self) -> int:
+        """Returns xxh3_64 of the values."""
+        told = getattr(self.values, "checksum", None)  # of values on a device
+        return int(checksum(self.values) if told is None else told())
+
 
 def check_values(
     values: NDArray[Any], pattern: FactorPattern, expected: int | None, seen: tuple[int, bool] | None = None,

@@ -14,6 +14,7 @@ import typer
 
 from protocol.network.endpoints import default_endpoint
 from protocol.process.command_line import Program, Terminated, end_in_order
+from protocol.process.memory import keep_long_lived
 from protocol.process.notify import Notifier
 from sim_server.errors import DeviceLost, InputError
 from sim_server.service.compile_notice import compile_notices
@@ -195,6 +196,7 @@ def run(o: Options, say: Callable[[str], None]) -> int:
             service.say = say
             announce(say, service, o.scene, o.listen or [default_endpoint(o.tls is not None)])
             wait_for_workers(service, supervisor)
+            keep_long_lived()
             describe_objects(say, service, o.listen, o.tls)
             service.health.notifier = notifier
             notifier.ready(f"{o.scene.name} on {', '.join(o.listen or ['loopback'])}")

@@ -29,7 +29,7 @@ MARK = 32  # bytes of the random mark by which a buffer is found in its segment
 OVERHEAD = 1 << 16  # bytes of a segment for zenoh's own data
 SMALLEST = 1 << 14  # bytes
 RESERVE = 32 << 20  # bytes of /dev/shm left to others
-LARGE = 4 << 20  # bytes of a slot that takes more than a few milliseconds to make, as its memory is cleared
+LARGE = 2 << 20  # bytes of a slot that takes more than a few milliseconds to make, as its memory is cleared
 
 
 class SlotsUnusable(Exception):

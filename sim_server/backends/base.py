@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from protocol.factor import Factor, FactorPattern
 from sim_server.arrays import Float64, Int32, Int64
+from sim_server.backends.shared_memory import SharedMemory
 from sim_server.backends.state import StateArray
 
 if TYPE_CHECKING:
@@ -276,6 +277,10 @@ class Engine(Protocol):
         From any thread."""
         ...
 
+    def shared_memory(self) -> SharedMemory | None:
+        """Returns device memory that other processes can open; None: there is none."""
+        ...
+
     def expect_factors(self, body: int, pattern: FactorPattern) -> None:
         """Prepares for factors of a pattern that will come, without waiting."""
         ...
@@ -339,6 +344,10 @@ class Engine(Protocol):
 
     def matrix_steps(self, bodies: Sequence[int]) -> Int64:
         """Returns `matrix_step` of each of some bodies."""
+        ...
+
+    def staged_matrix(self, body: int) -> int:
+        """Returns where the device has the matrix that was copied last; 0: nowhere, or with other numbers."""
         ...
 
     def replace(self, launch: int, new: Launch) -> PendingUpdate:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from protocol.channels import CHANNELS, MOST_JOBS, name_in
 from protocol.factor import Factor, FactorPattern, check_values
+from protocol.messages_pb2 import DeviceSlot as DeviceSlotMessage
 from protocol.messages_pb2 import Factor as FactorMessage
 from protocol.messages_pb2 import FactorBatch, Topology
 from protocol.messages_pb2 import FactorPattern as PatternMessage
@@ -31,6 +32,7 @@ from protocol.validate import (
     topology_checksum,
 )
 from sim_server.arrays import Float32, Float64
+from sim_server.backends.shared_memory import SharedMemory
 from sim_server.network.leases import InFlightJob
 from sim_server.network.native_copies import native_copies
 from sim_server.updates.factor_source import FactorMemory
@@ -95,11 +97,13 @@ class FactorDecoder:
     """Decodes messages of workers about objects that were announced. Its methods raise Refused.
 
     memory: makes the arrays that large factors are copied to (FactorSource.use_memory)
+    device: device memory in which factors may come
     """
 
     def __init__(self, incarnation: int):
         self._incarnation = incarnation
         self.memory: FactorMemory = np.empty
+        self.device: SharedMemory | None = None
         self.objects: dict[str, AnnouncedObject] = {}
         self._most_blocks = 0
         self._unsized: set[str] = set()  # objects that have had no factor in this epoch, nor has one like them
@@ -180,6 +184,9 @@ class FactorDecoder:
             raise Refused(f"Factor.pattern is {message.pattern:016x}, which was not sent before", "pattern")
         if message.nonzeros != pattern.nonzeros:
             raise Refused(f"Factor.nonzeros is {message.nonzeros}; allowed: {pattern.nonzeros}", "shape")
+        if message.HasField("device_slot"):
+            values = self._from_device(message.device_slot, pattern, job)
+            return self._made(known, pattern, values, job, message.seconds, message.remedy)
         if fetch is not None:
             return self._factor(known, pattern, fetch(), None, job, message.seconds, message.remedy)
         if message.HasField("slot"):
@@ -267,6 +274,13 @@ class FactorDecoder:
         positive: bool | None = None,
     ) -> Factor:  # fmt: skip
         check_values(values, pattern, checksum, seen, positive)
+        return self._made(known, pattern, values, job, seconds, remedy)
+
+    def _made(
+        self, known: AnnouncedObject, pattern: FactorPattern, values: Float32 | Float64, job: InFlightJob,
+        seconds: float, remedy: str,
+    ) -> Factor:  # fmt: skip
+        """Returns the factor of values that were checked."""
         known.largest[job.method] = max(known.largest.get(job.method, 0), pattern.nonzeros)
         self._unsized.discard(job.object)
         if job.method == COMPLETE and pattern.id not in known.complete.patterns:
@@ -296,6 +310,22 @@ class FactorDecoder:
         size = _check_slot((told.segment, told.offset, told.generation), nonzeros, job)
         values = (self.memory if size > LARGE else np.empty)(nonzeros, np.dtype(job.dtype))
         return values, copied(_slot(job).part(job.first, job.dtype, nonzeros), values, own=values)
+
+    def _from_device(self, told: DeviceSlotMessage, pattern: FactorPattern, job: InFlightJob) -> Float32 | Float64:
+        """Returns a copy of the values in the slot of device memory that was lent for the job, which are checked."""
+        slot = job.device_slot
+        if slot is None or self.device is None:
+            raise Refused("Factor.device_slot is set, but no slot was lent for this job", "slot")
+        if (told.handle, told.generation) != (slot.handle, job.device_generation):
+            raise Refused(
+                f"Factor.device_slot is {told.handle[:8].hex()} ({len(told.handle)} bytes), generation "
+                f"{told.generation}; allowed: {slot.handle[:8].hex()}, {job.device_generation}, as lent for this job",
+                "slot",
+            )
+        dtype = np.dtype(job.dtype)
+        if (size := pattern.nonzeros * dtype.itemsize) > slot.capacity:
+            raise Refused(f"Factor.nonzeros is {pattern.nonzeros}: {size} bytes in a slot of {slot.capacity}", "slot")
+        return self.device.take(slot.address, pattern, dtype)
 
     def _object(self, message: PatternMessage | FactorMessage, key: object, channel: str) -> AnnouncedObject:
         header = check_header(message, incarnation=self._incarnation, object=self.objects)

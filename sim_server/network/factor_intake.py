@@ -111,7 +111,8 @@ class FactorIntake:
         if message.parts and not message.failure:
             return self._fetch(message, job)
         decode = partial(self._book.decoder.decode, message, sample.payload, job)
-        if not message.failure and 4 * message.nonzeros > LARGE:  # its bytes are copied and checked beside the caller
+        on_device = message.HasField("device_slot")
+        if not message.failure and (on_device or 4 * message.nonzeros > LARGE):  # copied and checked beside the caller
             self._refuse_second(job)
             future = self._woken(self._thread.submit(decode))
             self._decoding[job.number] = Decoding(job, future, future.result, message.seconds, _slots_used(message))
@@ -302,6 +303,7 @@ class FactorIntake:
         fits = 0 < size <= capacity  # an incomplete factor may be the largest so far
         for what, shared, allocated in (("matrix", by_slot[0], bool(job.slots)), ("factor", by_slot[1], fits)):
             self._counters.add("bulk_shared" if shared else "bulk_copied", factors)
+            self._counters.add("bulk_on_device", factors if shared and job.device_slot is not None else 0)
             if allocated and not shared:
                 self._counters.add("slots_unused", factors - 1)
                 self._counters.trouble(
@@ -326,4 +328,5 @@ def _refuse(refusal: Refused) -> Factor:
 
 def _slots_used(message: FactorMessage, fetch: FactorFetch | None = None) -> tuple[bool, bool]:
     """Whether matrix and factor travelled in shared memory. fetch: of its parts"""
-    return message.matrix_shared, message.HasField("slot") or (fetch is not None and bool(fetch.slots))
+    in_slot = message.HasField("slot") or message.HasField("device_slot")
+    return message.matrix_shared, in_slot or (fetch is not None and bool(fetch.slots))

@@ -11,6 +11,7 @@ from typing import Protocol
 
 from protocol.refused import Refused
 from protocol.shared_memory.pool import Slot
+from sim_server.network.device_slots import DeviceSlot
 
 MIN_LEASE = 2.0  # s
 MAX_LEASE = 120.0  # s; also for the first job of an object at a worker, which may compile, import and analyse for it
@@ -28,22 +29,23 @@ MAX_EXPIRED = 2  # expired jobs with which a worker still gets slots of shared m
 class SlotAllocator(Protocol):
     """The pool that slots go back to."""
 
-    def give_back(self, slot: Slot, users: int = 1) -> None:
+    def give_back(self, slot: Slot | DeviceSlot, users: int = 1) -> None:
         """Frees a slot that so many jobs used."""
 
 
-@dataclass(frozen=True)
+@dataclass(eq=False, slots=True)
 class InFlightJob:
-    """A job sent to one worker. Times are monotonic [s].
+    """A job sent to one worker, which does not change. Times are monotonic [s].
 
     number: of the job, unique in the life of the server
     sent_at, deadline: begin and end of its lease
     exclusive_until: from then on another worker may be asked for the object
-    slots: shared memory allocated for the matrix and the factor
+    slots: shared memory allocated for the matrix and the factor, of the host or of a device
     room: bytes of the factor slot that are for this job, from `first` on
     payload_bytes: size of the values if they are in no slot
     positions: they are positions, from which the worker assembles the matrix
     part_bytes: of each part of a factor that travels in parts
+    device_slot, device_generation: in place of factor_slot, of a device
     """
 
     number: int
@@ -56,7 +58,7 @@ class InFlightJob:
     deadline: float
     factor_slot: Slot | None = None
     factor_generation: int = 0
-    slots: tuple[Slot, ...] = ()
+    slots: tuple[Slot | DeviceSlot, ...] = ()
     first: int = 0
     room: int = 0
     sent_at: float = 0.0
@@ -65,6 +67,8 @@ class InFlightJob:
     payload_bytes: int = 0
     positions: bool = False
     part_bytes: int = 0
+    device_slot: DeviceSlot | None = None
+    device_generation: int = 0
 
 
 class Leases:
@@ -116,11 +120,16 @@ class Leases:
 
     def start(self, job: InFlightJob) -> None:
         """Adds a job that is being sent."""
-        self.by_object[job.object] = job
-        self.by_worker.setdefault(job.worker, {})[job.number] = job
-        self._next_deadline = min(self._next_deadline, job.deadline)
+        self.start_all([job])
+
+    def start_all(self, jobs: Sequence[InFlightJob]) -> None:
+        """Adds jobs that are being sent to one worker."""
+        worker, deadlines = jobs[0].worker, [job.deadline for job in jobs]
+        self.by_object.update((job.object, job) for job in jobs)
+        self.by_worker.setdefault(worker, {}).update((job.number, job) for job in jobs)
+        self._next_deadline = min(self._next_deadline, *deadlines)
         if self._deadlines is not None:
-            self._deadlines[job.worker] = max(self._deadlines.get(job.worker, job.deadline), job.deadline)
+            self._deadlines[worker] = max(self._deadlines.get(worker, deadlines[0]), *deadlines)
 
     def cancel(self, job: InFlightJob) -> None:
         """Removes a job that was never sent."""
@@ -239,7 +248,7 @@ class Leases:
 
         lost = []
         for worker, jobs in self.by_worker.items():
-            if (period := idle(worker)) is not None:
+            if (period := idle(worker)) is not None and period[1] - period[0] > DELIVERY:
                 since = [(job, period[1] - max(period[0], sent_at(job))) for job in jobs.values()]
                 lost += [job for job, seconds in since if seconds > self.delivery_time(job)]
         return self._expire(lost)

@@ -1,11 +1,16 @@
 # SPDX-License-Identifier: MIT
-"""Copies of many arrays in native code (protocol/copies.py), compiled as all of the server's."""
+"""Copies of many arrays in native code (protocol/shared_memory/copies.py), compiled as all of the server's."""
 
 import ctypes
 from functools import cache
 
-from protocol.copies import SOURCE, Copies
-from sim_server.backends.compiler import build
+from protocol.shared_memory.copies import SOURCE, Copies
+from sim_server.backends.compiler import begin, build
+
+
+def compile_ahead() -> None:
+    """Begins to compile, so that the first copies do not wait for it. Raises CompileError."""
+    begin(SOURCE)
 
 
 @cache

@@ -119,7 +119,7 @@ class SolverOptions(Parameters):
     gpus: int = Field(
         default=1, ge=1, le=2, description="of this host that apply the factors of large bodies, on a GPU"
     )
-    warm_start: bool = Field(default=True, description="start from the last step's dv")
+    warm_start: bool = Field(default=True, description="start from what the last steps' solutions say of this one")
     woodbury: int = Field(
         default=32, ge=0, le=64,
         description="correct factors for grabs and contacts since, of at most this many nodes of an object; 0: off",

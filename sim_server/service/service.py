@@ -82,6 +82,7 @@ class Service:
         self.engine = simulation.engine
         self.engine.loop.realtime, self.engine.loop.patient = int(realtime), int(not realtime)
         self.driver = Driver(simulation, link.dispatch)
+        self._share_device()
         self.commands = Commands(simulation, self._record_interaction, self._frozen)
         self.telemetry = Telemetry(self.driver, link, recorder, not realtime, self.commands)
         self._set_intervals()
@@ -113,6 +114,12 @@ class Service:
         self.telemetry.open(resume)
         self.health = Health(Notifier())
         self.need = NeedMeter(self.driver)
+
+    def _share_device(self) -> None:
+        """Has matrices and factors stay on the device where workers can open its memory, and no step waits for them."""
+        if self.driver.wants_factors and self.driver.policy.free and (memory := self.engine.shared_memory()):
+            memory.sums = self.recorder is not None
+            self.link.share_device(memory)
 
     def _first_factors(self, realtime: bool) -> FirstFactors | None:
         """Returns the first factors that the first step waits for; None: it goes without."""

@@ -74,15 +74,15 @@ class JobState:
     checked: step of the matrix whose factor has come and is checked beside the steps; NONE: there is none
     matrix: of the job in flight: step and what was sent
     positions: the last job held positions, from which the worker assembles the matrix
-    excess: of the body when the last matrix was sent: to be restored if the job fails
+    excess_sent: of the body when the last matrix was sent: to be restored if the job fails
     """
 
-    in_flight, checked = Cell(), Cell()
+    in_flight, checked, excess_sent = Cell(), Cell(), Cell()
 
     def __init__(self, table: UpdateTable, index: int):
         self._table, self._index = table, index
         self._copy: NDArray[np.float64] | None = None
-        self.request, self.requested, self.extrapolated, self.excess = 0, 0.0, 0.0, 0.0
+        self.request, self.requested, self.extrapolated = 0, 0.0, 0.0
         self.matrix: tuple[int, NDArray[np.float64]] | None = None
         self.positions = False
 
@@ -93,6 +93,12 @@ class JobState:
     @copy.setter
     def copy(self, copy: NDArray[np.float64] | None) -> None:
         self._copy, self._table.copying[self._index] = copy, copy is not None
+
+    def on_sent(self, step: int) -> None:
+        """Takes note that the copy was sent, but for what stands in the table."""
+        copy, self._copy = self._copy, None
+        self.matrix = None if copy is None else (step, copy)
+        self.positions = copy is not None and copy.ndim == 2
 
     @property
     def sent(self) -> int | None:
@@ -219,11 +225,8 @@ class BodyUpdateState:
 
     def on_sent(self, step: int) -> None:
         """Takes note that the copy of `step` was sent. It is kept until its factor came, which is checked with it."""
-        job, solves = self.job, self.solves
-        job.matrix = None if job.copy is None else (step, job.copy)
-        job.positions = job.copy is not None and job.copy.ndim == 2
-        job.in_flight, job.sent, job.copy = True, step, None
-        job.excess, solves.excess = solves.excess, 0.0
+        self.job.on_sent(step)
+        on_sent(self._table, [self._index], [step])
 
     def on_check(self, step: int) -> None:
         """Takes note that the factor of `step` has come and is checked beside the steps: the next matrix may be sent
@@ -255,7 +258,7 @@ class BodyUpdateState:
     def on_reassignment(self) -> None:
         """Takes note that its job takes too long; it may be sent to another worker."""
         self.job.in_flight = False
-        self.solves.excess += self.job.excess
+        self.solves.excess += self.job.excess_sent
 
     def on_failure(self, reason: str, refused: bool = False, step: int | None = None) -> bool:
         """Takes note that a job failed; it may be sent again. Returns False if a newer one has been sent since.
@@ -356,6 +359,13 @@ def _add_changed(table: UpdateTable, row: NDArray[np.int64], above: Any, factor:
         total += np.where(counted, each, 0.0)
         latest = np.where(counted, each, latest)
     table.excess[row], table.latest[row], table.lost[row], table.factor_step[row] = total, latest, lost, last
+
+
+def on_sent(table: UpdateTable, rows: Sequence[int], steps: Sequence[int]) -> None:
+    """Takes note of copies that were sent, of some steps, in what the table has of them."""
+    row = np.asarray(rows, np.int64)
+    table.in_flight[row], table.copying[row], table.sent[row] = True, False, steps
+    table.excess_sent[row], table.excess[row] = table.excess[row], 0.0
 
 
 def on_factors(

@@ -182,7 +182,8 @@ class Driver:
         discarded."""
         assert state.job.copy is not None
         if self.snapshots.suffices(state) and self._is_present(state):
-            return self._job(state, self.snapshots.step(state), state.job.copy)
+            step = self.snapshots.step(state)
+            return self._job(state, step, state.job.copy, self.engine.staged_matrix(state.body.index))
         self.snapshots.discard(state)
         return None
 
@@ -201,16 +202,17 @@ class Driver:
         state.job.matrix = step, values
         return self._job(state, step, values)
 
-    def _job(self, state: BodyUpdateState, step: int, values: NDArray[np.float64]) -> Job:
+    def _job(self, state: BodyUpdateState, step: int, values: NDArray[np.float64], on_device: int = 0) -> Job:
         name, epoch = state.body.name, self.simulation.epoch(state.body.name, step)
-        if self.simulation.splits is not None and values.ndim == 3:  # the copy has room for more blocks
-            values = values[: len(self._patterns.at(name, epoch)[1])]
-        if self.source.epoch(name) not in (None, epoch):
-            for begin in self.on_epoch:
-                begin(state.body, epoch)
+        if self.simulation.splits is not None:
+            if values.ndim == 3:  # the copy has room for more blocks
+                values = values[: len(self._patterns.at(name, epoch)[1])]
+            if self.source.epoch(name) not in (None, epoch):
+                for begin in self.on_epoch:
+                    begin(state.body, epoch)
         method = self.solver.method if state.tuner is None else state.tuner.factorization.method
         state.on_job(step, method)
-        return Job(name, epoch, step, self._warped[name], values, self.solver.factor_dtype, method)
+        return Job(name, epoch, step, self._warped[name], values, self.solver.factor_dtype, method, on_device)
 
     # --- factors in ---------------------------------------------------------------------------------------------
 

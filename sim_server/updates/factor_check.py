@@ -10,7 +10,7 @@ import ctypes as c
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from functools import cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +19,7 @@ from protocol.factor import Factor, FactorPattern
 from sim_server.arrays import Int32
 from sim_server.backends.compiler import native
 from sim_server.backends.cpu import structs
-from sim_server.backends.cpu.engine import NativePattern
+from sim_server.backends.cpu.factors import NativePattern
 from sim_server.updates.patterns import Patterns
 
 Reals = NDArray[np.float64]
@@ -59,6 +59,7 @@ class CheckedBody:
         self.row_start, self.columns, self.probe = row_start, columns, probe
         self.factor_pattern = NativePattern(pattern)
         self.addresses = tuple(each.ctypes.data for each in (row_start, columns, probe))
+        self.native = c.addressof(self.factor_pattern.native)
 
     def fits(self, row_start: Int32, columns: Int32, pattern: FactorPattern) -> bool:
         """True if the arrays are still those."""
@@ -143,24 +144,21 @@ class FactorCheck:
             return self._probe_all(checked, applied)
 
     def _probe_all(self, checked: Sequence[tuple[Factor, Reals | None]], applied: Reals | None) -> list[Probe]:
-        count = len(checked)
-        factors, kept = (structs.Factor * count)(), []  # what is kept must live until the native code is done
-        nodes, pointers = np.zeros(count, np.int32), np.zeros((5, count), np.uintp)
-        for i, (factor, matrix) in enumerate(checked):
-            body, values = self._body(factor), np.ascontiguousarray(factor.values)
-            factors[i].pattern, factors[i].values = c.addressof(body.factor_pattern.native), values.ctypes.data
-            factors[i].step, factors[i].bytes = factor.step, values.itemsize
-            nodes[i] = len(body.row_start) - 1
-            pointers[:4, i] = *body.addresses, 0 if matrix is None else matrix.ctypes.data
-            pointers[4, i] = 0 if applied is None else applied.ctypes.data
-            kept.append((body, values))
+        bodies = [self._body(factor) for factor, _ in checked]
+        values = [np.ascontiguousarray(factor.values) for factor, _ in checked]
+        factors = np.zeros(len(checked), np.dtype(structs.Factor))
+        factors["pattern"], factors["values"] = [body.native for body in bodies], [_address(each) for each in values]
+        factors["step"], factors["bytes"] = [f.step for f, _ in checked], [each.itemsize for each in values]
+        nodes = np.array([len(body.row_start) - 1 for body in bodies], np.int32)
         if (needed := WORK * 3 * int(nodes.max())) > len(self._work):
             self._work = np.empty(needed)
-        out = np.zeros((count, 5))
-        row_start, columns, r, matrices, z = (each.ctypes.data for each in pointers)
+        row_start, columns, r = np.array([body.addresses for body in bodies], np.uintp).T.copy()
+        matrices = np.array([0 if matrix is None else _address(matrix) for _, matrix in checked], np.uintp)
+        z = np.full(len(checked), 0 if applied is None else _address(applied), np.uintp)
+        out = np.zeros((len(checked), 5))
         _library().wf_judge_all(
-            count, factors, nodes.ctypes.data, row_start, columns, matrices, r, z, self._work.ctypes.data,
-            out.ctypes.data,
+            len(checked), factors.ctypes.data_as(c.POINTER(structs.Factor)),
+            *(each.ctypes.data for each in (nodes, row_start, columns, matrices, r, z, self._work, out)),
         )  # fmt: skip
         za = np.where(out[:, [1, 3]] > 0, out[:, [1, 3]], np.inf)
         energy = out[:, [0, 2]] ** 2 / za
@@ -178,3 +176,8 @@ class FactorCheck:
         if size not in self._vectors:
             self._vectors[size] = np.random.default_rng(0).standard_normal(size)
         return self._vectors[size]
+
+
+def _address(array: NDArray[Any]) -> int:
+    address: int = array.__array_interface__["data"][0]
+    return address

@@ -206,6 +206,7 @@ def made(folder: Path, library: Any) -> ModuleType:
     }  # fmt: skip
     cp.RawModule, cp.asarray = RawModule, lambda x: array(np.array(x))
     cp.zeros = lambda shape, dtype=np.float64: array(np.zeros(shape, dtype))
+    cp.empty = cp.zeros
     cp.ones = lambda shape, dtype=np.float64: array(np.ones(shape, dtype))
     cp.full = lambda shape, value, dtype: array(np.full(shape, value, dtype))
     cp.empty_like = lambda like: array(np.empty_like(like))
@@ -213,6 +214,7 @@ def made(folder: Path, library: Any) -> ModuleType:
         runtime=SimpleNamespace(
             getDeviceCount=lambda: 1, CUDARuntimeError=type("CUDARuntimeError", (RuntimeError,), {}),
             getDeviceProperties=lambda number: properties, memcpyDeviceToDevice=3, memcpyHostToDevice=1,
+            memcpyDeviceToHost=2, memcpyDefault=4,
             runtimeGetVersion=lambda: 13000, **memory,
         ),
         Device=CurrentDevice, Event=lambda **o: SimpleNamespace(ptr=6, record=lambda stream=None: None),

@@ -13,7 +13,7 @@ from tests.bench.speed.turns import Side, percentiles
 
 
 def row_of(unit: str) -> dict[str, Any]:
-    """What tells the row of a unit apart, but for threads."""
+    """What tells the row of a unit apart, but for threads and settings."""
     kind, tets, *rest = unit.split(":")
     row: dict[str, Any] = {"what": "motion" if kind == "vbd" else kind, "tets": int(tets)}
     if kind == "steps":
@@ -26,7 +26,7 @@ def test_units_measure_what_is_aimed_at() -> None:
     there = [row_of(unit) for unit in UNITS]
     for target in TARGETS:
         assert set(target.where) <= set(KEYS)
-        where = {name: value for name, value in target.where.items() if name != "threads"}
+        where = {name: value for name, value in target.where.items() if name not in ("threads", "settings")}
         assert [row for row in there if where.items() <= row.items()], target.what
 
 
@@ -44,6 +44,9 @@ def test_a_row_tells_both_sides_and_whether_the_goal_is_met() -> None:
     assert (batch["before"], batch["now"], batch["met"]) == ("–", "4,999", "no")
     rows[1] |= {"p50": 0.6}
     assert summary(rows)[1]["met"] == "no"
+    large = {"what": "steps", "tets": 405_600, "material": "homogeneous", "beams": 1, "side": "after"}
+    both = [{**large, **percentiles([4.0])}, {**large, "settings": "solver.gpus=2", **percentiles([2.0])}]
+    assert [row["met"] for row in summary(both)] == [row["met"] for row in summary(both[::-1])] == ["no", "yes"]
 
 
 def test_a_side_says_what_went_wrong_and_goes_on() -> None:

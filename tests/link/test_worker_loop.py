@@ -88,7 +88,7 @@ class FakeConnection:
         self.asked: list[tuple[str, int | None]] = []
         self.objects: dict[str, int] = {}  # nodes of those that the scene tells of
         self.preconditioner = "cholesky"
-        self.told = 0  # times that it said hello
+        self.told, self.together = 0, 0  # times that it said hello; matrices that it factorizes together
         self.without_token: set[int] = set()
 
     def has_token(self, incarnation: int) -> bool:
@@ -298,6 +298,7 @@ def test_objects_of_one_pattern_are_factorized_together(together: Worker, connec
         assert (answer.header.object, answer.job, answer.failure) == ("abcd"[k], 10 + k, "")
         np.testing.assert_array_equal(np.frombuffer(data, np.float32), np.float32(np.sqrt(4.0 + k)))
     assert len(connection.answers) == 4 and connection.counters.jobs == 8 and connection.received.idle
+    assert connection.together == Together.most == 3, "as the server is told"
 
 
 def test_one_without_a_factor_does_not_spoil_those_of_others(together: Worker, connection: FakeConnection) -> None:

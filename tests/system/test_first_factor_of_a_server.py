@@ -12,12 +12,15 @@ import pytest
 from clients.client import Client
 from clients.log.reader import Log
 from sim_server import cli
+from sim_server.errors import InputError
 from sim_server.network.link import ServerLink
 from sim_server.replay.log import Recording
 from sim_server.replay.run import Replay
 from sim_server.service.service import Service
 from sim_server.service.supervisor import Supervisor
 from sim_server.simulation import Simulation
+from sim_server.startup import set_up
+from sim_server.startup.options import Options
 from tests.ports import free_endpoint
 from tests.system.hand_worker import HandWorker
 from tests.system.link_helpers import PATIENCE
@@ -115,3 +118,28 @@ def test_the_start_waits_until_all_is_ready_and_not_for_ever(
     supervisor: Any = SimpleNamespace(check=lambda: None)
     cli.wait_for_workers(service, supervisor)
     assert now[0] == pytest.approx(begins, abs=0.05)
+
+
+def test_workers_start_before_the_service_is_built_and_end_if_it_cannot_be(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    events: list[str] = []
+
+    def start(closing: ExitStack, *_: Any) -> str:
+        events.append("begin")
+        closing.callback(events.append, "end")
+        return "supervisor"
+
+    def fail(*_: Any) -> None:
+        events.append("service")
+        raise InputError("spoiled")
+
+    monkeypatch.setattr(set_up, "start_workers", start)
+    monkeypatch.setattr(set_up, "make_service", fail)
+    options = Options(
+        beam(tmp_path, bar=(1, 1, 2)), [], "cpu", "sim", [free_endpoint()], None, True, None, None, True, 1, "cpu",
+        None, True, None, None, False, None, [], None, None, None,
+    )  # fmt: skip
+    with pytest.raises(InputError, match="spoiled"), ExitStack() as closing:
+        set_up.set_up(closing, options)
+    assert events == ["begin", "service", "end"]

@@ -38,6 +38,7 @@ from sim_server.backends.gpu.measured import MeasuredReport
 from sim_server.backends.gpu.newton import NewtonIteration, NewtonPhases, begins_beside
 from sim_server.backends.gpu.pinned import pinned_array
 from sim_server.backends.gpu.rosenbrock import ATTEMPTS, RosenbrockStep
+from sim_server.backends.gpu.shared_device_memory import SharedDeviceMemory
 from sim_server.backends.gpu.solver import PCG_BODY, SETTINGS_BYTES, PcgSolver
 from sim_server.backends.gpu.splits import DeviceSplits, Staged
 from sim_server.backends.gpu.state import device_array, device_arrays
@@ -516,6 +517,10 @@ class GpuEngine(DeviceLoop):
     def factor_memory(self, count: int, dtype: np.dtype[Any]) -> NDArray[Any]:
         """Makes an array for values of a factor, from which the device copies them."""
         return pinned_array(self.gpu.cp, count, dtype)
+
+    def shared_memory(self) -> SharedDeviceMemory:
+        """Returns device memory that workers beside this process can open."""
+        return SharedDeviceMemory(self.gpu)
 
     def expect_factors(self, body: int, pattern: FactorPattern) -> None:
         """Begins to plan the inverses of factors of a pattern that will come, and to take memory for such factors,

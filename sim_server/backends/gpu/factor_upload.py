@@ -20,14 +20,17 @@ from dataclasses import dataclass, field
 from functools import partial
 from typing import Any, NamedTuple
 
+import numpy as np
 from numpy.typing import NDArray
 
 from protocol.factor import FactorPattern
 from sim_server.arrays import Float64
 from sim_server.backends.compiler import CompileError
 from sim_server.backends.gpu.device import Gpu, no_memory_left
+from sim_server.backends.gpu.device_values import DeviceValues
 from sim_server.backends.gpu.inverse.apply_inverse import Applied
 from sim_server.backends.gpu.inverse.build_inverse import InverseBuilder, InverseStorage, PartitionedInverse
+from sim_server.backends.gpu.inverse.device_digits import LARGE, is_large
 from sim_server.backends.gpu.loop import DeviceLoop
 from sim_server.backends.gpu.mailbox import DeviceMailbox
 from sim_server.backends.gpu.solver import SETTINGS_BYTES, PcgSolver, PlannedInverse
@@ -35,7 +38,7 @@ from sim_server.backends.gpu.structs import Mail
 
 log = logging.getLogger(__name__)
 
-SMALL = 1 << 20  # bytes of a factor that is copied at once
+SMALL = LARGE  # bytes of a factor that is copied at once
 MANY = 4  # small factors that come together, from which on none is built at once
 TOGETHER = 64  # factors of one plan that are handed over together
 AHEAD = 2  # such batches beside the caller: one is built, the next is there; what waits otherwise may be replaced
@@ -68,6 +71,7 @@ class UploadedFactor(NamedTuple):
 class GivenFactor:
     """A factor that came. Its values do not change any more.
 
+    source: its values where the inverse is built from, once its digits are chosen
     r: vector that its inverse is to be applied to. None: to none
     applied: P^-1 r on its way; None: nobody applies it
     wanted: it is to be used; False: once it is posted
@@ -75,10 +79,11 @@ class GivenFactor:
     """
 
     pattern: FactorPattern
-    values: NDArray[Any]
+    values: NDArray[Any] | DeviceValues
     step: int
+    source: NDArray[Any] | DeviceValues | None = None
     r: Float64 | None = None
-    applied: "Future[Applied | None]" = field(default_factory=Future)
+    applied: "Future[Applied | None] | None" = None
     wanted: bool = True
     dropped: bool = False
 
@@ -109,7 +114,7 @@ class ChosenPlan(NamedTuple):
     planes: int
     plan: Future[PlannedInverse]
     spare: InverseStorage | None
-    applied: "Future[Applied | None]"
+    applied: "Future[Applied | None] | None"
 
     def tell(self, applied: Applied | None) -> None:
         """Tells who waits for P^-1 r, if it is not told yet."""
@@ -194,7 +199,7 @@ class FactorUpload:
         self._uploads[body].expected = pattern.id
         self._solver.begin_plan(body, pattern)
 
-    def post(self, body: int, pattern: FactorPattern, values: NDArray[Any], step: int) -> None:
+    def post(self, body: int, pattern: FactorPattern, values: NDArray[Any] | DeviceValues, step: int) -> None:
         """Takes a factor: begins to build its inverse now, or once a storage is free.
 
         Returns at once: what takes long, plans and large factors, is done beside the caller. The values must not change
@@ -207,16 +212,17 @@ class FactorUpload:
                 self._begin_queued([body])
 
     def prepare(
-        self, body: int, pattern: FactorPattern, values: NDArray[Any], step: int, r: Float64
+        self, body: int, pattern: FactorPattern, values: NDArray[Any] | DeviceValues, step: int, r: Float64
     ) -> "Future[Applied | None]":  # fmt: skip
         """Builds the inverse of a factor, beside the caller, and applies it to r (n,); it is used once these very
         values are posted. Returns P^-1 r; None as its result if it comes to nothing."""
-        given = GivenFactor(pattern, values, step, r, wanted=False)
+        applied: Future[Applied | None] = Future()
+        given = GivenFactor(pattern, values, step, r=r, applied=applied, wanted=False)
         with self._lock:
             self._refresh(body)
             self._enqueue(body, given)
             self._begin_queued([body], beside=True)
-        return given.applied
+        return applied
 
     def may_prepare(self, body: int) -> bool:
         """True if the inverse of another factor would be begun at once."""
@@ -224,7 +230,7 @@ class FactorUpload:
             self._refresh(body)
             return self._uploads[body].free and self._uploads[body].queued is None
 
-    def drop(self, body: int, values: NDArray[Any]) -> None:
+    def drop(self, body: int, values: NDArray[Any] | DeviceValues) -> None:
         """Gives up a factor that was prepared and not posted; any other one is let alone."""
         with self._lock:
             uploads = self._uploads[body]
@@ -239,14 +245,14 @@ class FactorUpload:
                 uploads.queued = None
             self._begin_queued([body])
 
-    def _prepared(self, body: int, values: NDArray[Any]) -> GivenFactor | None:
+    def _prepared(self, body: int, values: NDArray[Any] | DeviceValues) -> GivenFactor | None:
         """Returns the factor with these values that is prepared and not posted."""
         uploads = self._uploads[body]
         building = None if uploads.building is None else uploads.building.given[body]
         coming = (uploads.queued, building, None if uploads.built is None else uploads.built[1])
         return next((each for each in coming if each is not None and not each.wanted and each.values is values), None)
 
-    def _use_prepared(self, body: int, values: NDArray[Any]) -> bool:
+    def _use_prepared(self, body: int, values: NDArray[Any] | DeviceValues) -> bool:
         """Has a prepared factor used, at once if it is built; False if there is none with these values."""
         uploads = self._uploads[body]
         given = self._prepared(body, values)
@@ -268,7 +274,7 @@ class FactorUpload:
             uploads.built = None
         uploads.queued = given
 
-    def post_many(self, given: Sequence[tuple[int, FactorPattern, NDArray[Any], int]]) -> None:
+    def post_many(self, given: Sequence[tuple[int, FactorPattern, NDArray[Any] | DeviceValues, int]]) -> None:
         """Takes factors, each as `post` takes one; of several of a body the last one counts. Inverses of many are built
         beside the caller, who would wait for one after another, those of one plan together."""
         with self._lock:
@@ -402,7 +408,18 @@ class FactorUpload:
 
     def _planes_of(self, given: Sequence[GivenFactor]) -> list[int]:
         """Returns the float16 numbers per entry that the inverse of each of some factors needs."""
-        return self._solver.planes_of([(each.pattern, each.values) for each in given])
+        sources = [self._source(each) for each in given]
+        if len(given) == 1 and isinstance(sources[0], DeviceValues):
+            return [self._solver.planes_on_device(given[0].pattern, sources[0], self._multiprocessors)]
+        return self._solver.planes_of([(g.pattern, np.asarray(s)) for g, s in zip(given, sources, strict=True)])
+
+    def _source(self, given: GivenFactor) -> NDArray[Any] | DeviceValues:
+        """Returns values of a factor as its inverse is built from them: large ones are brought to the device first if
+        their digits are to be chosen."""
+        if given.source is None:
+            large = is_large(given.values) and self._solver.planes is None
+            given.source = self._solver.brought(given.values) if large else given.values
+        return given.source
 
     def _choose_and_build(self, work: Sequence[Work], made: Future[list[UploadedFactor | Exception]]) -> None:
         """Begins to build inverses, in the thread of the plans: now, or behind their plans."""
@@ -483,7 +500,7 @@ class FactorUpload:
         builder, able, multiprocessors = planned.builder, list(storages), self._multiprocessors
         for k in range(0, len(able), builder.most):
             some = able[k : k + builder.most]
-            values = [chosen[place].given.values for place in some]
+            values = [self._source(chosen[place].given) for place in some]
             inverses = builder.build_many(values, [storages[place] for place in some], multiprocessors)
             for place, inverse in zip(some, inverses, strict=True):
                 given, planes = chosen[place].given, chosen[place].planes
@@ -587,6 +604,7 @@ class FactorUpload:
             )
 
 
-def _tell(waiting: "Future[Applied | None]", applied: Applied | None) -> None:
-    with suppress(InvalidStateError):
-        waiting.set_result(applied)
+def _tell(waiting: "Future[Applied | None] | None", applied: Applied | None) -> None:
+    if waiting is not None:
+        with suppress(InvalidStateError):
+            waiting.set_result(applied)

@@ -301,3 +301,11 @@ class DeviceLoop(Reports):
             steps: Int64 = self._copied_steps[list(bodies)]
             return steps
         return np.array([self.matrix_step(body) for body in bodies], np.int64)
+
+    def staged_matrix(self, body: int) -> int:
+        """Returns the device address of the copy requested last, once it is complete: the same float64 values
+        (blocks, 3, 3), until the next request. 0: there is none."""
+        entry = self._readbacks[body]
+        if not self.loop.staged or entry.copied_step < 0 or self._real != np.float64:
+            return 0
+        return int(self.loop.staged) + int(entry.staged_begin)

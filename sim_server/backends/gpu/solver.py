@@ -17,9 +17,11 @@ from sim_server.backends.compiler import SOURCES
 from sim_server.backends.gpu.correction import FactorCorrection
 from sim_server.backends.gpu.cupy_types import DeviceArray, KernelFunction
 from sim_server.backends.gpu.device import Gpu, compiled, options, own_headers
+from sim_server.backends.gpu.device_values import DeviceValues
 from sim_server.backends.gpu.followed_rows import FollowedRows
 from sim_server.backends.gpu.helper import LEAST_NODES, FarVectors, Helper
 from sim_server.backends.gpu.inverse.build_inverse import InverseBuilder, PartitionedInverse, builder_kernels
+from sim_server.backends.gpu.inverse.device_digits import LARGE, LargeFactors, digits_kernels
 from sim_server.backends.gpu.inverse.device_plan import DevicePlan, shared_bytes
 from sim_server.backends.gpu.inverse.digits import library as digits_library
 from sim_server.backends.gpu.inverse.digits import planes_of
@@ -165,12 +167,14 @@ class PcgSolver:
         self._application = self._compiled(application, blocks) if application else None
         self._device = cp.cuda.Device()
         self._planner = ThreadPoolExecutor(1, "plans of inverses")
+        self._large = LargeFactors(gpu)
         if planes is None:
             digits_library()  # before a factor waits for it
         self._lock = threading.Lock()
         self._plans: dict[tuple[int, int, int], Future[PlannedInverse]] = {}  # by pattern, planes, thread blocks
         self._vectors: dict[tuple[int, int], dict[str, DeviceArray]] = {}  # by body and plan
         self._far_vectors: dict[tuple[int, int], FarVectors] = {}  # likewise, of bodies that a second GPU helps
+        self._plan_in_row: dict[int, DevicePlan] = {}  # by body
         self._factor_bytes = [0] * len(ranges)
 
     @property
@@ -283,10 +287,21 @@ class PcgSolver:
     def compile_builder(self) -> None:
         """Has the kernels that build inverses compiled beside the caller, before a factor waits for them."""
         self.beside(lambda: builder_kernels(self.gpu))
+        if self.planes is None:
+            self.beside(lambda: digits_kernels(self.gpu))
 
     def planes_of(self, factors: Sequence[tuple[FactorPattern, NDArray[Any]]]) -> list[int]:
         """Returns the float16 numbers per entry that the inverse of each of some factors gets. From any thread."""
         return planes_of(factors) if self.planes is None else [self.planes] * len(factors)
+
+    def brought(self, values: NDArray[Any] | DeviceValues) -> NDArray[Any] | DeviceValues:
+        """Returns values of a large factor on the device, if there is memory for them. In the thread of the plans."""
+        return self._large.brought(values)
+
+    def planes_on_device(self, pattern: FactorPattern, values: DeviceValues, multiprocessors: int | None) -> int:
+        """As `planes_of`, estimated on the device. In the thread of the plans. multiprocessors: that this keeps busy
+        at most; None: all"""
+        return self._large.planes_for(pattern, values, multiprocessors) if self.planes is None else self.planes
 
     def beside(self, work: Callable[[], T]) -> Future[T]:
         """Has work done in the thread of the plans, one after another."""
@@ -335,6 +350,8 @@ class PcgSolver:
         helper = self._helper if (self._helped & alike).any() else None  # bodies of one size are all helped, or none
         most = int((alike & (self.bodies["blocks"] == blocks // (2 if helper else 1))).sum())
         builder = InverseBuilder(self.gpu, pattern, found, most, helper)
+        if self.planes is None and 4 * pattern.nonzeros > LARGE:
+            self._large.expect(pattern)
         warps, own = self.threads // 32, blocks // 2 if helper else blocks
         far = helper.plan(found, warps) if helper else None
         return PlannedInverse(DevicePlan(self.gpu, found, warps, 0 if self._helper else None, own), builder, far)
@@ -360,17 +377,19 @@ class PcgSolver:
     def use(self, body: int, pattern: FactorPattern, inverse: PartitionedInverse, planes: int, step: int) -> None:
         """Writes a factor into the host row of a body; it is in use once the row is uploaded."""
         device_plan, row = self.plan(body, pattern, planes), self.bodies[body]
-        row["plan"], row["matrix"], row["scale"] = device_plan.address, inverse.matrix, inverse.scale
-        row["planes"], row["factor_step"] = planes, step
-        self.reserve_vectors(body, device_plan)
-        for name, address in self._addresses(body, device_plan).items():
-            row[name] = address
+        row["matrix"], row["scale"], row["factor_step"] = inverse.matrix, inverse.scale, step
+        if self._plan_in_row.get(body) is not device_plan:
+            self._plan_in_row[body] = device_plan
+            row["plan"], row["planes"] = device_plan.address, planes
+            self.reserve_vectors(body, device_plan)
+            for name, address in self._addresses(body, device_plan).items():
+                row[name] = address
+            self._factor_bytes[body] = device_plan.bytes
         row["helper"] = 0
         if self._helper and inverse.far:
             far_plan = self.begin_plan(body, pattern, planes).result().far
             assert far_plan is not None
             row["helper"] = self._helper.use(row, inverse.far, far_plan, self._far_vectors[body, device_plan.address])
-        self._factor_bytes[body] = device_plan.bytes
 
     def _addresses(self, body: int, plan: DevicePlan) -> dict[str, int]:
         """Returns the addresses of the vectors of a body, by name."""

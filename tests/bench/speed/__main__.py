@@ -49,7 +49,7 @@ def measured(sides: Sides, unit: str, o: argparse.Namespace) -> list[Row]:
         rounds = 1 if o.quick else ROUNDS[tets] if beams == 1 else BATCH_ROUNDS
         library = "gpu" if gpu and tets >= 24_000 else "auto"
         long = 0 if beams == 1 else LONG
-        return turns.steps(sides, Problem(tets, material, beams), rounds, library, o.device, long)
+        return turns.steps(sides, Problem(tets, material, beams), rounds, library, o.device, long, o.set)
     if kind == "real_time":
         order = {"text": Problem(tets, dt=DT).text(), "seconds": o.seconds, "dt": DT}
         return turns.in_turn(sides, kind, {"tets": tets}, **order, **devices)
@@ -79,6 +79,7 @@ def options() -> argparse.Namespace:
     parser.add_argument("--commit", help="of that checkout [default: as git says]")
     parser.add_argument("--units", nargs="+", default=list(UNITS), metavar="UNIT", help="[default: all]")
     parser.add_argument("--device", choices=("cpu", "gpu"), default="gpu", help="of all but threads and sofa")
+    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="of the scenes of steps")
     parser.add_argument("--threads", type=int, nargs="+", default=[1, 2, 4, 8, 12])
     parser.add_argument("--rounds", type=int, default=2, help="of sofa")
     parser.add_argument("--seconds", type=float, default=4.0, help="of servers, each")
@@ -101,7 +102,10 @@ def main() -> None:
         return
     checkouts = dict(zip(SIDES, (o.other, ROOT), strict=True)) if o.other else {SIDES[1]: ROOT}
     other = {"beside": o.commit or commit_of(o.other)} if o.other else {}
-    report, limit = Piece("speed", TITLE, {**other, "units": o.units}, o.out, o.quick), Limit(o.limit)
+    report, limit = (
+        Piece("speed", TITLE, {**other, "units": o.units, **({"set": o.set} if o.set else {})}, o.out, o.quick),
+        Limit(o.limit),
+    )
     machine = report.head()["machine"]
     place = {"cpu": f"{machine['cpu']}, {machine['cores']} cores", "gpu": machine["gpu"]}
     rows: list[Row] = []

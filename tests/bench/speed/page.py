@@ -8,12 +8,13 @@ from tests.bench.harness.report import Report
 from tests.bench.speed.targets import TARGETS, Target
 
 Row = dict[str, Any]
-KEYS = ("what", "tets", "material", "beams", "threads", "side")
+KEYS = ("what", "tets", "material", "beams", "threads", "settings", "side")
 
 
 def of(rows: Sequence[Row], where: Row, side: str) -> Row | None:
     """The row of a side that a target means."""
-    return next((r for r in rows if r["side"] == side and all(r.get(k) == v for k, v in where.items())), None)
+    wanted = {"side": side, "settings": None, **where}
+    return next((row for row in rows if all(row.get(k) == v for k, v in wanted.items())), None)
 
 
 def _told(row: Row | None, target: Target) -> str:
@@ -48,7 +49,8 @@ TABLES = (
         "threads",
         "One body on the threads of a CPU",
         "SOFA's beam (below) on `[solver] threads`: turns of 8 steps with a factor of their first matrix, the same "
-        "for both; wall ms of steps.",
+        "for both; wall ms of steps. GB/s of L: bytes of the factor that its solves read, twice an iteration, over "
+        "the time of the whole solve.",
     ),
     (
         "sofa",

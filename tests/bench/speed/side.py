@@ -102,15 +102,15 @@ def turn(name: str, file: str, begun: bool, steps: int) -> Answer:
     engine = scenes[name].engine
     with np.load(file) as found:
         parts = [found[key] for key in ("permutation", "super_start", "row_start", "rows")]
-        engine.post_factor(0, FactorPattern.build(*parts), found["values"], step=engine.step)
+        values = found["values"]
+    engine.post_factor(0, FactorPattern.build(*parts), values, step=engine.step)
     if begun:
         engine.solve()
     engine.run(steps - begun)
     r = engine.records()[1:]  # the first one of one run has a factorization within
-    return {
-        "ms": (1e3 * (r["assemble"] + r["solve"] + r["integrate"])).tolist(),
-        "iterations": r["iterations"].tolist(),
-    }
+    rate = 2 * values.nbytes * r["iterations"].sum() / r["solve"].sum()  # L and its transpose, once an iteration
+    ms = 1e3 * (r["assemble"] + r["solve"] + r["integrate"])
+    return {"ms": ms.tolist(), "iterations": r["iterations"].tolist(), "GB/s": 1e-9 * float(rate)}
 
 
 def round(name: str, library: str, variants: int, steps: int, counted: bool = False) -> Answer:

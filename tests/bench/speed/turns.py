@@ -106,8 +106,10 @@ def threads(sides: Sides, tets: int, numbers: Sequence[int], turns: int) -> list
     for n in numbers:
         everywhere(sides, "drop", name=f"{n}")
     return [
-        {"what": "threads", "tets": tets, "threads": n, "side": side, **_ms(rows)} for (side, n), rows in found.items()
-    ]
+        {"what": "threads", "tets": tets, "threads": n, "side": side, **_ms(rows),
+         "GB/s of L": float(np.median([row["GB/s"] for row in rows]))}
+        for (side, n), rows in found.items()
+    ]  # fmt: skip
 
 
 def sofa(sides: Sides, tets: int, rounds: int) -> list[Row]:
@@ -126,7 +128,9 @@ def sofa(sides: Sides, tets: int, rounds: int) -> list[Row]:
     return rows
 
 
-def steps(sides: Sides, problem: Problem, rounds: int, library: str, device: str, long: int = 0) -> list[Row]:
+def steps(
+    sides: Sides, problem: Problem, rounds: int, library: str, device: str, long: int = 0, settings: Sequence[str] = ()
+) -> list[Row]:  # fmt: skip
     """Steps with factors at most AGE steps old. long: of them without a pause after that, for the host's time."""
     for name, answer in everywhere(
         sides, "load", name="beam", text=problem.text(), overrides=[], device=device
@@ -140,6 +144,7 @@ def steps(sides: Sides, problem: Problem, rounds: int, library: str, device: str
     runs = {name: [side("run", name="beam", steps=long)] if long else found[name] for name, side in sides.items()}
     everywhere(sides, "drop", name="beam")
     label = {"what": "steps", "tets": problem.tets, "material": problem.material, "beams": problem.beams}
+    label |= {"settings": " ".join(settings)} if settings else {}
     return [
         {**label, "side": name, **_ms(rows), "most": max(row["most"] for row in rows),
          "residual": max(row["residual"] for row in rows),

@@ -15,6 +15,7 @@ from protocol.factor import FactorPattern
 from sim_server.arrays import Float64
 from sim_server.backends.gpu.cupy_types import DeviceArray, Event, Graph, KernelFunction
 from sim_server.backends.gpu.device import Gpu, no_memory_left
+from sim_server.backends.gpu.device_values import DeviceValues
 from sim_server.backends.gpu.helper import FarInverse, Helper
 from sim_server.backends.gpu.inverse.apply_inverse import Applied, InverseApplication, application_kernels
 from sim_server.backends.gpu.inverse.expansion_batches import (
@@ -119,7 +120,7 @@ class InverseBuilder:
         return made._replace(far=self._helper.storage(p)) if self._helper else made
 
     def build(
-        self, values: NDArray[np.floating], storage: InverseStorage, multiprocessors: int | None = None
+        self, values: NDArray[np.floating] | DeviceValues, storage: InverseStorage, multiprocessors: int | None = None
     ) -> PartitionedInverse:
         """Begins to build the inverse for the values (nonzeros,) of L; returns before it is complete.
 
@@ -132,8 +133,11 @@ class InverseBuilder:
         return self.build_many([values], [storage], multiprocessors)[0]
 
     def build_many(
-        self, values: Sequence[NDArray[np.floating]], storages: Sequence[InverseStorage], multiprocessors: int | None
-    ) -> list[PartitionedInverse]:
+        self,
+        values: Sequence[NDArray[np.floating] | DeviceValues],
+        storages: Sequence[InverseStorage],
+        multiprocessors: int | None,
+    ) -> list[PartitionedInverse]:  # fmt: skip
         """Begins to build the inverses of up to `most` factors in the same launches; otherwise as `build`.
 
         Each has the same bits as if it were built alone.
@@ -150,7 +154,8 @@ class InverseBuilder:
             return self._application.begin(inverse.matrix, inverse.scale, r, self._workspace.stream, most)
 
     def _begin(
-        self, values: Sequence[NDArray[np.floating]], storages: Sequence[InverseStorage], multiprocessors: int | None
+        self, values: Sequence[NDArray[np.floating] | DeviceValues], storages: Sequence[InverseStorage],
+        multiprocessors: int | None,
     ) -> list[PartitionedInverse]:  # fmt: skip
         space, cp, count = self._workspace, self._gpu.cp, len(values)
         assert 0 < count <= self.most and count == len(storages)
@@ -166,10 +171,10 @@ class InverseBuilder:
         if all(each.dtype == np.float32 and is_pinned(each) for each in values):
             copy(at, space.staging.ctypes.data, HEAD, kind, stream.ptr)
             for begin, source, length in runs(values):
-                copy(at + HEAD + begin, source, length, kind, stream.ptr)
+                copy(at + HEAD + begin, source, length, cp.cuda.runtime.memcpyDefault, stream.ptr)
         else:
             for row, factor in zip(space.staging[HEAD:size].view(np.float32).reshape(count, -1), values, strict=True):
-                np.copyto(row, factor, casting="same_kind")
+                np.copyto(row, np.asarray(factor), casting="same_kind")
             copy(at, space.staging.ctypes.data, size, kind, stream.ptr)
         space.copied, space.source = stream.record(), list(values)
         graph.launch(stream)

@@ -24,7 +24,7 @@ NAMES = ("XXH3_64bits_dispatch", "XXH3_64bits")  # the first one chooses the bes
 
 
 @cache
-def _hash() -> int | None:
+def hash_address() -> int | None:
     """Address of xxh3_64 in the library of the package xxhash; None if it does not offer it to others."""
     library, sample = c.CDLL(import_module("xxhash._xxhash").__file__), bytes(range(256)) * 9
     for name in NAMES:
@@ -44,7 +44,7 @@ class Copies:
     """
 
     def __init__(self, library: c.CDLL | None):
-        self._library = library if _hash() is not None else None
+        self._library = library if hash_address() is not None else None
         if self._library is not None:
             i, p = c.c_int32, c.c_void_p
             arguments: list[Any] = [c.c_int64, p, p, p, i, i, p, p, p, i]
@@ -84,7 +84,7 @@ class Copies:
         threads = 1 + min(helping_threads(), count - 1) if int(size.sum()) > ALONE else 1
         self._library.copy_all(
             count, begin.ctypes.data, None if targets is None else targets.ctypes.data, size.ctypes.data, item,
-            own_sources, _hash(), sums.ctypes.data, finite.ctypes.data, threads,
+            own_sources, hash_address(), sums.ctypes.data, finite.ctypes.data, threads,
         )  # fmt: skip
         return sums.tolist(), finite.tolist()
 

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: MIT
-"""Copies of many arrays in native code (protocol/copies.py), where it is to be had."""
+"""Copies of many arrays in native code (protocol/shared_memory/copies.py), where it is to be had."""
 
 import ctypes
 from functools import cache
 
-from protocol.copies import SOURCE, Copies
+from protocol.shared_memory.copies import SOURCE, Copies
 
 
 @cache
