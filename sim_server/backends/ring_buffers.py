@@ -126,7 +126,7 @@ def part_of_ring(ring: NDArray[Any], tail: int, head: int) -> NDArray[Any]:
 def _bytes_of(array: NDArray[Any]) -> memoryview:
     """Views a contiguous array as bytes. NumPy would copy these without Python's lock, which takes longer to get back,
     where other threads are at work, than to copy the records of a batch."""
-    return memoryview(array.reshape(-1).view(np.uint8))
+    return array.reshape(-1).view(np.uint8).data
 
 
 def as_bytes(structs: NDArray[Any]) -> NDArray[Any]:
