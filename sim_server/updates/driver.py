@@ -85,6 +85,8 @@ class Driver:
             self.check.prepare()
             self.engine.prepare_for_factors()
             self.source.use_memory(self.engine.factor_memory)
+            if self.policy.free:
+                self.engine.prepare_copies()
         self.reactions: Float64 = np.zeros((0, 0, 6))
         self.other_reactions: NDArray[Any] = np.zeros(0, REACTION)
         self.readings: Float64 = np.zeros((0, 0))
