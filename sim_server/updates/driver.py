@@ -85,6 +85,8 @@ class Driver:
             self.check.prepare()
             self.engine.prepare_for_factors()
             self.source.use_memory(self.engine.factor_memory)
+            if self.policy.free:
+                self.engine.prepare_copies()
         self.reactions: Float64 = np.zeros((0, 0, 6))
         self.other_reactions: NDArray[Any] = np.zeros(0, REACTION)
         self.readings: Float64 = np.zeros((0, 0))
@@ -158,8 +160,8 @@ class Driver:
     def requests(self, ahead: bool = False) -> UpdateRequests:
         """Returns what the scheduler is told of each body but those that are frozen.
 
-        ahead: instead of those whose last factor is checked beside the steps, only of these: of those whose next matrix
-            may go ahead of it. It does where factors have been of use and `auto` compares none
+        ahead: only of those whose last factor is checked beside the steps, which count as in flight otherwise: of those
+            whose next matrix may go ahead of it. It does where factors have been of use and `auto` compares none
         """
         t, step = self.table, self.engine.step
         tuners = [state.tuner for state in self.bodies] if self._tuned else []
@@ -167,13 +169,14 @@ class Driver:
         age = np.where((t.newest >= 0) & ~t.dropped, step - t.newest, NONE)
         iteration_cost, cost = (np.where(np.isnan(each), 1.0, each) for each in (t.iteration_cost, t.cost))
         waited = np.where(t.sent >= 0, step - t.sent, NONE)
-        every = UpdateRequests(
-            np.arange(len(t)), t.excess, waited, t.in_flight | t.copying, age, iteration_cost, cost, t.failures,
-            t.lost, on_trial, t.latest,
-        )  # fmt: skip
         checked = t.checked != NONE
+        on_its_way = t.in_flight | t.copying | (False if ahead else checked)
+        every = UpdateRequests(
+            np.arange(len(t)), t.excess, waited, on_its_way, age, iteration_cost, cost, t.failures, t.lost, on_trial,
+            t.latest,
+        )  # fmt: skip
         if not ahead:
-            return every.of(~(t.frozen | checked))
+            return every.of(~t.frozen)
         compared = np.array([t is not None and t.factorization.candidate is not None for t in tuners] or False)
         return every.of(checked & ~t.frozen & (age >= 0) & (t.failures == 0) & ~compared)
 
