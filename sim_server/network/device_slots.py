@@ -66,6 +66,11 @@ class DeviceSlots:
         """Bytes of all slots, and of those that are being made."""
         return sum(slot.capacity + DEVICE_HEADER for slot in self._slots) + sum(self._making.values())
 
+    @property
+    def makes_any(self) -> bool:
+        """True if a slot is being made in a thread."""
+        return not all(making.done() for making in self._making)
+
     def lend(self, sizes: Sequence[int]) -> list[DeviceSlot] | None:
         """Lends a slot for each of some numbers of bytes, in new generations; None if one is not there (yet)."""
         self._take_made()

@@ -99,7 +99,7 @@ class Dispatch(FactorSource):
     def makes_slots(self) -> bool:
         """True while shared memory for arrays is being made beside the caller."""
         with self._lock:
-            return self._pool is not None and self._pool.makes_any
+            return any(slots is not None and slots.makes_any for slots in (self._pool, self.device))
 
     def announce(self, topology: Topology) -> None:
         """Begins a new epoch of an object; answers to jobs of the last one are refused."""

@@ -191,6 +191,7 @@ def made(folder: Path, library: Any) -> ModuleType:
     }  # fmt: skip
     cp.RawModule, cp.asarray = RawModule, lambda x: array(np.array(x))
     cp.zeros = lambda shape, dtype=np.float64: array(np.zeros(shape, dtype))
+    cp.empty = cp.zeros
     cp.ones = lambda shape, dtype=np.float64: array(np.ones(shape, dtype))
     cp.full = lambda shape, value, dtype: array(np.full(shape, value, dtype))
     cp.empty_like = lambda like: array(np.empty_like(like))
