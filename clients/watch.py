@@ -20,7 +20,7 @@ from clients.log.scalars import ended, enum_name, reaction_name
 from protocol import messages_pb2 as pb
 
 PERIOD = 0.5  # s between two readings
-MOST_KEY = 44  # characters of a parameter that are not broken into lines
+MOST_KEY = 36  # characters of a parameter that are not broken into lines
 ERRORS = {  # fields of ObjectStep with estimated errors -> of what
     "solve_error": "error of the linear solve",
     "step_error": "of the step's equation",
