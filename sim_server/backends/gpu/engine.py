@@ -38,6 +38,7 @@ from sim_server.backends.gpu.newton import NewtonIteration, NewtonPhases, begins
 from sim_server.backends.gpu.pinned import pinned_array
 from sim_server.backends.gpu.rosenbrock import ATTEMPTS, RosenbrockStep
 from sim_server.backends.gpu.shared_device_memory import SharedDeviceMemory
+from sim_server.backends.gpu.smoothing import FactorSmoothing
 from sim_server.backends.gpu.solver import PCG_BODY, SETTINGS_BYTES, PcgSolver
 from sim_server.backends.gpu.splits import DeviceSplits, Staged
 from sim_server.backends.gpu.state import device_array, device_arrays
@@ -129,6 +130,7 @@ class GpuEngine(DeviceLoop):
         self._forces = fuse(forces) if alone else ()  # after a whole assembly, whose energy balance is made already
         phases = NewtonPhases.initial(gpu, bodies) if newton else None
         correction = self._correction = FactorCorrection.wanted(gpu, given)
+        self._smoothing = FactorSmoothing.wanted(gpu, given)
         most_blocks = given.cut.most_blocks if given.cut else ()
         surfaces = given.contact.surfaces if given.contact else None
         self._rows_of_bodies: tuple[NDArray[Any], ...] = (
@@ -140,7 +142,7 @@ class GpuEngine(DeviceLoop):
             phases.of_solves(errors) if phases else (), ATTEMPTS if stages else 0,
             given.contact is not None,
             given.contact is not None and bool(given.contact.surfaces or given.contact.ties), correction, errors,
-            budgets, given.cut,
+            budgets, given.cut, self._smoothing,
         )  # fmt: skip
         self._newton, newton_results = None, None
         if newton and phases:
@@ -288,7 +290,8 @@ class GpuEngine(DeviceLoop):
 
     def state(self) -> list[StateArray]:
         """Returns what the device carries on beside the arrays that launches write."""
-        parts = (self._energies, self.stages, self._substeps, self._contact, self._correction, self._splits)
+        solves = self._correction, self._smoothing
+        parts = (self._energies, self.stages, self._substeps, self._contact, *solves, self._splits)
         clock = self.gpu.twin(self._arrays["clock"])
         found = [device_array("engine.clock", clock), *(a for part in parts if part for a in part.state())]
         if self._rows_of_bodies:

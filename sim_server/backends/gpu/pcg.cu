@@ -29,6 +29,9 @@
 #ifdef BUDGETS
 #include "step_budget.cuh"
 #endif
+#ifdef SMOOTHED
+#include "smoothing_state.cuh"
+#endif
 
 struct BlockMemory {  // static shared memory of a thread block: data that is the same in all threads needs no registers
     double scratch[3 * WARPS][4], totals[4];
@@ -61,6 +64,11 @@ struct BlockMemory {  // static shared memory of a thread block: data that is th
 #ifdef BUDGETS
     long long began, deadline;     // of the solve [ns]
     long long looked;              // at the clock, by the first thread of the first thread block
+#endif
+#ifdef SMOOTHED
+    long long slow;                // of the body, as solves before left it
+    int limit;                     // iterations after which a solve may go on smoothed
+    double first_r2;               // |r|^2 at the start
 #endif
 };
 __shared__ BlockMemory memory;
@@ -732,6 +740,9 @@ __device__ __forceinline__ void PcgSolver::solve() {
                 const double end = memory.goal;
 #endif
                 memory.quarter = r2 * sqrt(sqrt(end / r2));
+#ifdef SMOOTHED
+                memory.first_r2 = r2;
+#endif
                 if (refused || r2 <= memory.goal) {
                     if (refused) {
                         out.status = NOT_FINITE;
@@ -768,6 +779,14 @@ __device__ __forceinline__ void PcgSolver::solve() {
         stop = r2 <= memory.goal ? CONVERGED : -1;
 #ifdef ERRORS
         if (enough) stop = CONVERGED;
+#endif
+#ifdef SMOOTHED
+#ifdef CORRECTED
+        const bool alone = !prepares && !corrects;
+#else
+        constexpr bool alone = true;
+#endif
+        if (stop < 0 && iterations == memory.limit && kind == CHOLESKY && alone && is_slow(iterations, memory.first_r2, r2, memory.goal)) stop = SLOW;
 #endif
         if (stop < 0) {
 #ifdef CORRECTED
@@ -885,6 +904,9 @@ __device__ __forceinline__ void solve_body(const PcgArguments& s, const RowRange
     const int k = range.body;
     for (int i = threadIdx.x; i < (int)(sizeof(PcgBody) / 4); i += THREADS) ((int*)&memory.body)[i] = ((const int*)(s.bodies + k))[i];
     if (threadIdx.x == THREADS - 1) memory.rests = s.moving[k] == 0;
+#ifdef SMOOTHED
+    if (threadIdx.x == THREADS - 33) memory.slow = s.slow[k];  // the warp before
+#endif
 #ifdef SPLITS
     __syncthreads();
     if (threadIdx.x == 0 && memory.body.factor_step < s.split_step[k]) memory.body.plan = nullptr;  // of another pattern
@@ -912,6 +934,9 @@ __device__ __forceinline__ void solve_body(const PcgArguments& s, const RowRange
         memory.correction.used = correction.bodies[k].used;
         memory.correction.usable = correction.bodies[k].usable;
     }
+#endif
+#ifdef SMOOTHED
+    if (threadIdx.x == 0) memory.limit = smoothing_limit(memory.body, memory.slow);
 #endif
     __syncthreads();
     const long long begin = nanoseconds();
@@ -995,6 +1020,9 @@ __device__ __forceinline__ void solve_body(const PcgArguments& s, const RowRange
         note_pass(pass.state[k], pass, memory.outcome, result, out);
 #else
         result = out;
+#endif
+#ifdef SMOOTHED
+        if (out.status == SLOW) *s.unfinished = s.step[0];
 #endif
         s.exchange_number[k] = solver.group.number;  // read by all blocks before the first exchange
     }

@@ -101,4 +101,6 @@ struct PcgArguments {
     const real* at_rest;           // -DCUTS: (nodes,) 1 at nodes without elements (cut_nodes.cuh)
     const long long* split_step;   // -DSPLITS: (bodies,) steps completed when the body was split last: older factors are not used
     int nodes, shared;             // of the scene; bytes of dynamic shared memory
+    long long* slow;               // -DSMOOTHED: (bodies,) what solves leave to later ones (smoothing_state.cuh)
+    long long* unfinished;         // likewise: (1,) step of the last solve that goes on smoothed
 };

@@ -26,6 +26,7 @@ from sim_server.backends.gpu.inverse.digits import library as digits_library
 from sim_server.backends.gpu.inverse.digits import planes_of
 from sim_server.backends.gpu.inverse.plan import plan
 from sim_server.backends.gpu.row_partition import SPARED, best_assignment, halo, initial_ranges, lists_of
+from sim_server.backends.gpu.smoothing import FactorSmoothing
 from sim_server.backends.gpu.structs import CONTACT, CORRECTION, PCG, PCG_RESULT, STAGES
 
 T = TypeVar("T")
@@ -78,6 +79,7 @@ class PcgSolver:
     correction: of factors for grabs and contacts; None: they are not corrected
     errors: True for a scene whose solves estimate the errors of positions (iterate_error.cuh)
     budgets: True for a scene whose solves may end by their wall time (step_budget.cuh); they estimate errors, too
+    smoothing: of factors that are too old; None: they are left as they are
     cut: what tells of nodes that lose elements, and how many blocks A has at most; None: no body can be cut
 
     followed: what follows the pattern of A then (`follow`), else None
@@ -93,7 +95,7 @@ class PcgSolver:
         self, gpu: Gpu, ranges: Sequence[tuple[int, int]], arrays: Mapping[str, NDArray[Any]], counter: DeviceArray,
         capacity: int, planes: int | None = 1, phases: Sequence[DeviceArray] = (), attempts: int = 0,
         contact: bool = False, between: bool = False, correction: FactorCorrection | None = None, errors: bool = False,
-        budgets: bool = False, cut: CutInput | None = None,
+        budgets: bool = False, cut: CutInput | None = None, smoothing: FactorSmoothing | None = None,
     ):  # fmt: skip
         cp, processors = gpu.cp, gpu.properties["multiProcessorCount"]
         self.gpu, self.counter, self._capacity, self.planes, self._phases = gpu, counter, capacity, planes, phases
@@ -140,6 +142,9 @@ class PcgSolver:
             "pool_counter": self.pool_counter, "results": self.results, "step": counter,
             "begun": cp.zeros(1, np.int64), "clocks": cp.zeros(len(ranges) * TRIAL_CLOCK.itemsize, np.uint8),
         }  # fmt: skip
+        smoothing = None if assigned.pooled else smoothing  # smoothed.cu has no pool
+        if smoothing:
+            self._work |= smoothing.memory
         if cut:
             self._work["at_rest"] = gpu.twin(cut.at_rest)
             assert self._work["at_rest"].dtype == self.real
@@ -148,11 +153,13 @@ class PcgSolver:
         fixed = 5120 if correction else 2048  # bytes: shared memory that pcg.cu declares, and the driver's
         self._shared = (gpu.properties["sharedMemPerMultiprocessor"] // blocks - fixed - 1024) // 16 * 16
         self.params = self._arguments(total, assigned.pooled)
-        self._function = self._compiled("pcg", blocks)
-        application = "apply_factor" if attempts else "island_factor" if between else None
-        self._application = self._compiled(application, blocks) if application else None
         self._device = cp.cuda.Device()
         self._planner = ThreadPoolExecutor(1, "plans of inverses")
+        made = self.beside(lambda: self._compiled("smoothed", blocks)) if smoothing else None
+        self._function = self._compiled("pcg", blocks)
+        self._smoothed = made.result() if made else None
+        application = "apply_factor" if attempts else "island_factor" if between else None
+        self._application = self._compiled(application, blocks) if application else None
         self._large = LargeFactors(gpu)
         if planes is None:
             digits_library()  # before a factor waits for it
@@ -210,6 +217,7 @@ class PcgSolver:
                 *(["-DCONTACT_PASSES"] if self._contact else []), *(["-DCORRECTED"] if corrected else []),
                 *(["-DERRORS"] if self.errors and name == "pcg" else []),
                 *(["-DBUDGETS"] if self.budgets and name == "pcg" else []),
+                *(["-DSMOOTHED"] if "slow" in self._work and name == "pcg" else []),
                 *(["-DCUTS"] if self._cut and name == "pcg" else []),
                 *(["-DSPLITS"] if self.followed else []),
             ),
@@ -229,6 +237,8 @@ class PcgSolver:
         phases = (np.uint64(array.data.ptr) for array in self._phases)
         arguments = (params, *phases, *self._corrected)
         self._function((self.grid,), (self.threads,), arguments, shared_mem=self._shared)
+        if self._smoothed:
+            self._smoothed((self.grid,), (self.threads,), (params,), shared_mem=self._shared)
 
     @property
     def _corrected(self) -> tuple[NDArray[Any], ...]:

@@ -33,6 +33,7 @@ from sim_server.backends.gpu.inverse.plan import Plan
 from sim_server.backends.gpu.inverse.workspace import workspace
 from sim_server.backends.gpu.pinned import is_pinned, runs
 
+ALIGNMENT = 64  # numbers; 256 bytes, as of what is allocated alone
 HEAD = BUILDS.itemsize  # bytes in front of the values: struct Builds
 COUNTS = (1, 4, 16, MOST_BUILDS)  # of inverses, for which graphs are made
 Groups = tuple[int, int, int, int]
@@ -113,6 +114,15 @@ class InverseBuilder:
         made = InverseStorage(cp.zeros((p.chunks, ROWS, COLUMNS), np.float16), cp.zeros(p.size + 1, np.float32))
         cp.cuda.get_current_stream().synchronize()  # zero before a build writes, in its own stream
         return made
+
+    def several_storages(self, count: int) -> list[InverseStorage]:
+        """Allocates memory for several inverses at once, which is given up once none of them is used."""
+        cp, p = self._gpu.cp, self.plan
+        pitch = -(-(p.size + 1) // ALIGNMENT) * ALIGNMENT
+        matrices = cp.zeros((count, p.chunks, ROWS, COLUMNS), np.float16)
+        scales = cp.zeros((count, pitch), np.float32)[:, : p.size + 1]
+        cp.cuda.get_current_stream().synchronize()
+        return [InverseStorage(matrix, scale) for matrix, scale in zip(matrices, scales, strict=True)]
 
     def build(
         self, values: NDArray[np.floating] | DeviceValues, storage: InverseStorage, multiprocessors: int | None = None
