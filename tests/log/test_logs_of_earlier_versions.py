@@ -36,7 +36,8 @@ def machine() -> dict[str, str]:
 class Differences(Comparison):
     """Collects by how much solves and frames differ, too.
 
-    more, fewer: iterations than recorded, at most; distance [m]: largest difference of positions; exact: entries of EXACT that differ
+    more, fewer: iterations than recorded, at most; distance [m]: largest difference of positions; exact: entries of
+    EXACT that differ
     """
 
     def __init__(self, recording: Recording):
