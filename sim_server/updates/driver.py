@@ -68,6 +68,7 @@ class Driver:
     def __init__(self, simulation: Simulation, source: FactorSource | None = None, counted: bool | None = None):
         self.simulation, self.engine = simulation, simulation.engine
         self.solver = simulation.scene.solver
+        self._method, self._dtype = self.solver.method, self.solver.factor_dtype  # of each of thousands of jobs
         world, self._patterns = simulation.world, Patterns.of(simulation)
         alone = simulation.scene.uses_factor_alone  # in place of A: it must be exact, so nothing is to choose from
         self.inline, self.check = Inline(self._patterns), FactorCheck(self._patterns, alone)
@@ -215,9 +216,9 @@ class Driver:
             if self.source.epoch(name) not in (None, epoch):
                 for begin in self.on_epoch:
                     begin(state.body, epoch)
-        method = self.solver.method if state.tuner is None else state.tuner.factorization.method
+        method = self._method if state.tuner is None else state.tuner.factorization.method
         state.on_job(step, method)
-        return Job(name, epoch, step, self._warped[name], values, self.solver.factor_dtype, method, on_device)
+        return Job(name, epoch, step, self._warped[name], values, self._dtype, method, on_device)
 
     # --- factors in ---------------------------------------------------------------------------------------------
 
