@@ -325,6 +325,10 @@ class Engine(Protocol):
         """Has the values of the next matrix of the body copied into `target` (blocks, 3, 3)."""
         ...
 
+    def prepare_copies(self) -> None:
+        """Makes the memory of copies of matrices, for which the first request would wait."""
+        ...
+
     def copy_memory(self, body: int) -> Float64 | None:
         """Returns memory (blocks, 3, 3) that the loop brings the next matrix of a body to by itself: as target of
         `request_matrix` it saves a copy. The matrix behind that one leaves it alone. None: there is none such."""

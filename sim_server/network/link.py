@@ -7,6 +7,7 @@ until they are read. Methods are for the service thread, except `close`; those o
 
 import logging
 import secrets
+import sys
 import time
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
@@ -48,6 +49,7 @@ from sim_server.network.send_queue import SendQueue
 
 log = logging.getLogger(__name__)
 
+SWITCH_SECONDS = 5e-4  # for which a thread may keep Python's lock while the thread that serves the loop wants it back
 TOKENS = 4096  # liveliness tokens of clients that may wait to be read
 REPLIES = 1024  # replies to commands that may wait to be sent
 
@@ -85,6 +87,7 @@ class ServerLink:
         clock: Callable[[], float] = time.monotonic,
     ):
         self.name = check_name(name, "server name")
+        sys.setswitchinterval(min(SWITCH_SECONDS, sys.getswitchinterval()))
         self.incarnation = secrets.randbits(63) | 1
         self.counters = Counters(log)
         self.local_workers: Callable[[], list[LocalWorker]] = list

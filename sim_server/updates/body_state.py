@@ -314,9 +314,12 @@ def excess(records: Any, floor: int, error_bound: Any) -> Any:
     its error over the bound [m], since it has no iterations, and a factor that ages costs accuracy instead.
     records: of the loop, of any shape that error_bound is broadcast to
     """
-    stages = np.where(records["form"] == ONE_SOLVE, 1, STAGES)
-    above = np.maximum(records["iterations"] - floor * stages * np.maximum(records["linearizations"], 1), 0)
-    alone = records["form"] == FACTOR
+    form = records["form"]
+    stages = np.where(form == ONE_SOLVE, 1, STAGES)
+    above = np.maximum(records["iterations"] - floor * stages * np.maximum(records["linearizations"], 1), 0.0)
+    alone = form == FACTOR
+    if not alone.any():  # of a thousand bodies each operation counts
+        return above
     return np.where(alone, np.where(alone, records["estimate"], 0.0) / error_bound, above)
 
 
@@ -329,7 +332,7 @@ def observe_steps(table: UpdateTable, r: NDArray[Any], floor: int) -> None:
     above = excess(r, floor, table.error_bound)
     weights = (1 - MEMORY) ** np.arange(steps - 1, -1, -1)
     each = r["solve"] / (r["iterations"] + 1)
-    costs = weights @ each / weights.sum()
+    costs = each[0] if steps == 1 else weights @ each / weights.sum()
     before = np.where(np.isnan(table.iteration_cost), each[0], table.iteration_cost)
     table.iteration_cost[:] = costs + (1 - MEMORY) ** steps * (before - costs)
     table.refused += r["fallbacks"].sum(axis=0)

@@ -68,6 +68,7 @@ class Driver:
     def __init__(self, simulation: Simulation, source: FactorSource | None = None, counted: bool | None = None):
         self.simulation, self.engine = simulation, simulation.engine
         self.solver = simulation.scene.solver
+        self._method, self._dtype = self.solver.method, self.solver.factor_dtype  # of each of thousands of jobs
         world, self._patterns = simulation.world, Patterns.of(simulation)
         alone = simulation.scene.uses_factor_alone  # in place of A: it must be exact, so nothing is to choose from
         self.inline, self.check = Inline(self._patterns), FactorCheck(self._patterns, alone)
@@ -85,6 +86,8 @@ class Driver:
             self.check.prepare()
             self.engine.prepare_for_factors()
             self.source.use_memory(self.engine.factor_memory)
+            if self.policy.free:
+                self.engine.prepare_copies()
         self.reactions: Float64 = np.zeros((0, 0, 6))
         self.other_reactions: NDArray[Any] = np.zeros(0, REACTION)
         self.readings: Float64 = np.zeros((0, 0))
@@ -158,8 +161,9 @@ class Driver:
     def requests(self, ahead: bool = False) -> UpdateRequests:
         """Returns what the scheduler is told of each body but those that are frozen.
 
-        ahead: instead of those whose last factor is checked beside the steps, only of these: of those whose next matrix
-            may go ahead of it. It does where factors have been of use and `auto` compares none
+        ahead: only of those whose last factor is checked beside the steps, which count as in flight otherwise: of those
+            whose next matrix may go ahead of it, one alone: there are two places for copies. It does where factors
+            have been of use and `auto` compares none
         """
         t, step = self.table, self.engine.step
         tuners = [state.tuner for state in self.bodies] if self._tuned else []
@@ -167,15 +171,17 @@ class Driver:
         age = np.where((t.newest >= 0) & ~t.dropped, step - t.newest, NONE)
         iteration_cost, cost = (np.where(np.isnan(each), 1.0, each) for each in (t.iteration_cost, t.cost))
         waited = np.where(t.sent >= 0, step - t.sent, NONE)
-        every = UpdateRequests(
-            np.arange(len(t)), t.excess, waited, t.in_flight | t.copying, age, iteration_cost, cost, t.failures,
-            t.lost, on_trial, t.latest,
-        )  # fmt: skip
         checked = t.checked != NONE
+        on_its_way = t.in_flight | t.copying | (False if ahead else checked)
+        every = UpdateRequests(
+            np.arange(len(t)), t.excess, waited, on_its_way, age, iteration_cost, cost, t.failures, t.lost, on_trial,
+            t.latest,
+        )  # fmt: skip
         if not ahead:
-            return every.of(~(t.frozen | checked))
+            return every.of(~t.frozen)
         compared = np.array([t is not None and t.factorization.candidate is not None for t in tuners] or False)
-        return every.of(checked & ~t.frozen & (age >= 0) & (t.failures == 0) & ~compared)
+        last = checked & (t.sent == t.checked)
+        return every.of(last & ~t.frozen & (age >= 0) & (t.failures == 0) & ~compared)
 
     def make_job(self, state: BodyUpdateState) -> Job | None:
         """Returns the job of the copy that the loop has made for a body. None: the copy does not suffice and is
@@ -210,9 +216,9 @@ class Driver:
             if self.source.epoch(name) not in (None, epoch):
                 for begin in self.on_epoch:
                     begin(state.body, epoch)
-        method = self.solver.method if state.tuner is None else state.tuner.factorization.method
+        method = self._method if state.tuner is None else state.tuner.factorization.method
         state.on_job(step, method)
-        return Job(name, epoch, step, self._warped[name], values, self.solver.factor_dtype, method, on_device)
+        return Job(name, epoch, step, self._warped[name], values, self._dtype, method, on_device)
 
     # --- factors in ---------------------------------------------------------------------------------------------
 

@@ -62,6 +62,8 @@ class UpdateRequests:
 
     def of(self, chosen: Any) -> "UpdateRequests":
         """Returns the requests that an index or a mask chooses."""
+        if isinstance(chosen, np.ndarray) and chosen.dtype == np.bool_ and chosen.all():
+            return self
         return UpdateRequests(*(getattr(self, field.name)[chosen] for field in fields(self)))
 
 

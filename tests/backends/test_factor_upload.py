@@ -76,6 +76,9 @@ class Maker:
         self.storages.append([])
         return self.storages[-1]
 
+    def several_storages(self, number: int) -> list[list[int]]:
+        return [self.storage() for _ in range(number)]
+
     spared, planes = 8, None
     most = 3  # inverses that are built together
 
@@ -656,7 +659,10 @@ def test_one_of_many_that_cannot_be_used_is_told_alone(many, caplog):
             raise NoMemory("full")
         return storage()
 
-    maker.storage = spoiled
+    def full(number: int) -> list[list[int]]:
+        raise NoMemory("full")  # for all together; they are made one by one then
+
+    maker.storage, maker.several_storages = spoiled, full
     with caplog.at_level(logging.WARNING):
         post_all(upload, list(range(1, len(boxes) + 1)))
         maker.thread.submit(lambda: None).result()

@@ -118,6 +118,17 @@ def test_a_matrix_that_no_step_makes_is_made_before_the_step_for_a_copy():
     assert scene.loop.matrix_step(0) == 20 and (positions == 21).all()
 
 
+def test_memory_of_copies_may_be_made_before_the_first_request(monkeypatch):
+    scene, made = FakeScene(bodies=2), []
+    scene.loop.prepare_copies()
+    monkeypatch.setattr(scene.device, "pinned", made.append)
+    monkeypatch.setattr(scene.device, "memory", made.append)
+    target = np.zeros((2, 3, 3))
+    scene.loop.request_matrix(1, target)
+    scene.loop.run(5)
+    assert scene.loop.matrix_step(1) >= 0 and made == []
+
+
 def test_the_elastic_energy_is_evaluated_after_the_steps_where_it_is_wanted():
     scene = FakeScene(bodies=2)
     scene.loop.run(2 * BATCH)

@@ -187,7 +187,7 @@ def test_several_at_a_time_have_the_bits_of_each_alone(gpu, groups, planes, limi
     builder = InverseBuilder(gpu, shape, p, 64)
     assert builder.most == 64
     for count in (1, 2, 4, 5, 21):
-        storages = [builder.storage() for _ in range(22)]
+        storages = builder.several_storages(22) if pinned else [builder.storage() for _ in range(22)]
         made = builder.build_many(values[:count], storages[:count], limit)
         made[-1].event.synchronize()
         for storage, inverse, (chunks, scale) in zip(storages, made, alone, strict=False):

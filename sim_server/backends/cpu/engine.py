@@ -399,6 +399,9 @@ class CpuEngine(Reports):
         """The same of some bodies."""
         return np.array([self._body[body].snapshot_step for body in bodies], np.int64)
 
+    def prepare_copies(self) -> None:
+        """Does nothing: who asks for a copy gives its memory."""
+
     def copy_memory(self, body: int) -> None:
         """The loop copies to where it is told."""
         return None

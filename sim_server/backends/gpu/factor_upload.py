@@ -488,10 +488,14 @@ class FactorUpload:
     ) -> None:  # fmt: skip
         """Fills in what is made at some places, each in a storage, a new one unless there is one to spare."""
         storages: dict[int, InverseStorage] = {}  # by place
+        made_new = iter(self._new_storages(planned.builder, sum(chosen[place].spare is None for place in places)))
         for place in places:
             try:
-                spare = chosen[place].spare
-                storage = planned.builder.storage() if spare is None else spare
+                storage = chosen[place].spare
+                if storage is None:
+                    storage = next(made_new, None)
+                if storage is None:
+                    storage = planned.builder.storage()
                 self._solver.reserve_vectors(chosen[place].body, planned.plan)
                 storages[place] = storage
             except Exception as error:
@@ -507,6 +511,17 @@ class FactorUpload:
                 made[place] = UploadedFactor(inverse, storages[place], given.step, given.pattern, planes)
             for place, inverse in zip(some, inverses, strict=True):
                 self._apply(builder, inverse, chosen[place])
+
+    def _new_storages(self, builder: InverseBuilder, count: int) -> list[InverseStorage]:
+        """Makes storages for several inverses at once; none where they are few, or there is too little memory."""
+        if count < MANY:
+            return []
+        try:
+            return builder.several_storages(count)
+        except Exception as error:
+            if not no_memory_left(error):
+                raise
+            return []
 
     def _apply(self, builder: InverseBuilder, inverse: PartitionedInverse, chosen: ChosenPlan) -> None:
         """Begins to apply an inverse for the check of its factor, which goes without where that cannot be done: the

@@ -267,8 +267,12 @@ class DeviceLoop(Reports):
             self._own_memory[place] = memory.view(np.float64).reshape(-1, 3, 3)
         return self._own_memory[place]
 
+    def prepare_copies(self) -> None:
+        """Makes the memory of copies, which is page-locked: while it is made all calls to CUDA wait."""
+        self._staging()
+
     def _staging(self) -> NDArray[Any]:
-        """Returns the page-locked memory of copies, made at the first request."""
+        """Returns the page-locked memory of copies, made at the first request at the latest."""
         if not self.loop.staged:
             self.loop.staged = self._device.memory(self._value_bytes)
             self._pinned_values = self._device.pinned(self._value_bytes)

@@ -20,12 +20,15 @@ Row = dict[str, Any]
 PATIENCE = 120.0  # s for the first factor
 
 
-def measure(beams: int, tets: int, device: str, worker: str, first: float, seconds: float) -> Row:
+def measure(
+    beams: int, tets: int, device: str, worker: str, first: float, seconds: float, schedule: str = "excess"
+) -> Row:  # fmt: skip
     """Measures for `seconds`, from when all beams use their second factor: some of the first ones are old, as they
     waited for the others. Begins `first` seconds at most after a first factor came, for which a worker on a GPU may
     compile its kernels, as the server does those that build inverses."""
     with tempfile.TemporaryDirectory() as folder:
-        sim = Simulation.load(Problem(tets, beams=beams).write(Path(folder)), device=device)
+        scene = Problem(tets, beams=beams).write(Path(folder))
+        sim = Simulation.load(scene, [f"solver.schedule={schedule}"], device=device)
     with Served(sim, worker) as served:
         driver, adopted, cpu = served.driver, [0], 0.0
         for body in sim.world.bodies[1:]:
@@ -59,7 +62,7 @@ def measure(beams: int, tets: int, device: str, worker: str, first: float, secon
     taken_up = len(np.unique(np.stack([own["body"], own["factor_step"]]), axis=1).T) - len(np.unique(own["body"]))
     steps = len(r) / beams
     return {
-        "beams": beams, "tets": tets, "worker": worker, "first factor after s": came - begun,
+        "beams": beams, "tets": tets, "worker": worker, "schedule": schedule, "first factor after s": came - begun,
         "all use one after s": ready, "without": without,
         "factors/s": count / seconds, "used/s": taken_up / seconds,
         "service us/factor": 1e6 * cpu / max(count, 1), "steps/s": steps / seconds,
@@ -78,8 +81,10 @@ def main() -> None:
     parser.add_argument("--worker", default="gpu")
     parser.add_argument("--first", type=float, default=15.0, help="s after the first factor, at most")
     parser.add_argument("--seconds", type=float, default=4.0)
+    parser.add_argument("--schedule", default="excess", choices=("excess", "round_robin"))
     o = parser.parse_args()
-    print(json.dumps(measure(o.beams, o.tets, o.device, o.worker, o.first, o.seconds)), flush=True)
+    row = measure(o.beams, o.tets, o.device, o.worker, o.first, o.seconds, o.schedule)
+    print(json.dumps(row), flush=True)
 
 
 if __name__ == "__main__":
