@@ -20,6 +20,7 @@ from clients.log.scalars import ended, enum_name, reaction_name
 from protocol import messages_pb2 as pb
 
 PERIOD = 0.5  # s between two readings
+MOST_KEY = 36  # characters of a parameter that are not broken into lines
 ERRORS = {  # fields of ObjectStep with estimated errors -> of what
     "solve_error": "error of the linear solve",
     "step_error": "of the step's equation",
@@ -56,7 +57,7 @@ def _summary(status: pb.Status) -> Text:
         f"late {status.late_steps}; dropped: frames {status.frames_dropped}, step records {status.records_dropped}; "
         f"lost to the log {status.records_lost}, left out of it {status.records_thinned}",
         f"refused: messages {status.refused}, commands {status.commands_refused}; "
-        f"arrays through shared memory {status.bulk_shared}, "
+        f"arrays through shared memory {status.bulk_shared}{_on_device(status)}, "
         f"as bytes {status.bulk_copied}; clients {len(status.clients)}",
     ]
     if status.recording_failure:
@@ -160,13 +161,18 @@ def _energies(status: pb.Status) -> list[Table]:
     return [table] if shown else []
 
 
+def _on_device(status: pb.Status) -> str:
+    """How many of them stayed in memory of a GPU, if any did."""
+    return f" ({status.bulk_on_device} of them on the device)" if status.bulk_on_device else ""
+
+
 def _workers(status: pb.Status) -> Table | Text:
     if not status.workers:
         return Text("no workers")
     table = Table("worker", "host", "pid", "library", "threads", "jobs", "failed", "refused", "shm", **COMPACT)
     for worker in status.workers:
         numbers = (worker.threads, worker.jobs, worker.failures, worker.refused)
-        shared = "yes" if worker.shared_memory else "no"
+        shared = "device" if worker.device_memory else "yes" if worker.shared_memory else "no"
         _add(table, worker.worker, worker.host, str(worker.pid), worker.library, *map(str, numbers), shared)
     return table
 
@@ -182,6 +188,8 @@ def _local(status: pb.Status) -> Table:
 def parameter_table(found: Sequence[pb.LiveParameter]) -> Table:
     """Returns a table of keys, values, units and meanings."""
     table = Table("key", "value", "unit", "about", **COMPACT)
+    longest = max((len(short_key(each.now.key)) for each in found), default=0)
+    table.columns[0].min_width, table.columns[0].max_width = min(MOST_KEY, longest), MOST_KEY
     table.columns[0].overflow = table.columns[1].overflow = "fold"
     for each in found:
         _add(table, short_key(each.now.key), each.now.value, each.unit, each.about.split(", or ")[0])

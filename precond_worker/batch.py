@@ -1,8 +1,10 @@
 # SPDX-License-Identifier: MIT
 """Jobs that came in one message, and their answers, which leave in one message."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import compress
 from typing import Any
 
 import numpy as np
@@ -10,16 +12,16 @@ import zenoh
 from numpy.typing import NDArray
 
 from precond_worker.arrays import Float64, Int64
+from precond_worker.network.native_copies import native_copies
 from protocol.channels import CHANNELS, MOST_JOBS
-from protocol.factor import FactorPattern
+from protocol.factor import ROOM_ALIGNMENT, FactorPattern
 from protocol.messages_pb2 import FactorBatch, Header, Matrix, MatrixBatch
 from protocol.refused import Refused
 from protocol.shared_memory.pool import HEADER
 from protocol.shared_memory.view import SlotMap
-from protocol.validate import array, check_header, check_strings, checksum, parse, take
+from protocol.validate import array, check_header, check_strings, parse, take
 
 ENTRY = 9  # values of a block
-ALIGNMENT = 64  # bytes to which the room of a factor is rounded up
 
 
 @dataclass(eq=False)
@@ -40,6 +42,25 @@ class Batch:
         """First byte of the room of each factor, and the bytes of all, (jobs + 1,)."""
         return np.concatenate([[0], np.cumsum(np.array(self.message.rooms, np.int64))])
 
+    @cached_property
+    def known_patterns(self) -> list[list[int]]:
+        """Ids of the patterns that the server has for each job."""
+        ends, every = np.cumsum(self.message.known).tolist(), list(self.message.known_patterns)
+        return [every[end - count : end] for end, count in zip(ends, self.message.known, strict=True)]
+
+    def matrices(self, places: Sequence[int], slots: SlotMap) -> list[Float64]:
+        """Returns some of the matrices, (blocks, 3, 3), in place if in shared memory. Raises Refused unless all have
+        their checksums."""
+        if self.shared:
+            every = slots.array(self.message.matrix_slot, np.float64, int(self.starts[-1]))
+            found = [every[begin:end] for begin, end in self.starts[np.add.outer(places, [0, 1])].tolist()]
+        else:
+            found = [self.matrix(place, slots) for place in places]
+        sums, _ = native_copies().sum_up(found)
+        if sums != [self.message.checksums[place] for place in places]:
+            raise Refused("MatrixBatch.checksums do not match the values: lost or overwritten", "checksum")
+        return [values.reshape(-1, 3, 3) for values in found]
+
     def matrix(self, place: int, slots: SlotMap) -> Float64:
         """Returns the values of one of the matrices, in place if in shared memory; raises Refused."""
         begin, end, all_of_them = (int(n) for n in self.starts[[place, place + 1, -1]])
@@ -52,7 +73,6 @@ class Batch:
     def entry(self, place: int) -> Matrix:
         """Returns one of the jobs as it would come alone, without slots."""
         m = self.message
-        first = sum(m.known[:place])
         header = Header(
             protocol=m.header.protocol, incarnation=m.header.incarnation, object=m.objects[place],
             epoch=m.epochs[place], sequence=m.jobs[place],
@@ -60,7 +80,7 @@ class Batch:
         return Matrix(
             header=header, step=m.steps[place], warp=m.warps[place], blocks=m.blocks[place],
             checksum=m.checksums[place], factor_dtype=m.factor_dtype, method=m.method,
-            known_patterns=m.known_patterns[first : first + m.known[place]], lease=m.leases[place], worker=m.worker,
+            known_patterns=self.known_patterns[place], lease=m.leases[place], worker=m.worker,
             drop_tolerance=m.drop_tolerance, fill=m.fill, omega=m.omega,
             topology=m.topologies[place] if m.topologies else 0,
         )  # fmt: skip
@@ -87,8 +107,8 @@ def accept_batch(sample: zenoh.Sample, worker: str, incarnation: int) -> Batch:
     for slot, needed in ((message.matrix_slot, 8 * batch.starts[-1]), (message.factor_slot, batch.rooms[-1])):
         if needed > slot.capacity:
             raise Refused(f"MatrixBatch has a slot of {slot.capacity} bytes; needed: {needed}", "slot")
-    if any(room % ALIGNMENT for room in message.rooms):
-        raise Refused(f"MatrixBatch.rooms: not all are multiples of {ALIGNMENT}", "slot")
+    if any(room % ROOM_ALIGNMENT for room in message.rooms):
+        raise Refused(f"MatrixBatch.rooms: not all are multiples of {ROOM_ALIGNMENT}", "slot")
     return batch
 
 
@@ -104,19 +124,25 @@ class BatchAnswer:
         self._remedies: list[str] = []
 
     def add(
-        self, place: int, slots: SlotMap, pattern: FactorPattern, values: NDArray[Any], seconds: float, remedy: str
-    ) -> bool:  # fmt: skip
-        """Writes a factor into its room; False if it is too large for it. Raises Refused if this answer is late."""
-        batch, slot = self._batch, self._batch.message.factor_slot
-        begin, end, all_of_them = (int(n) for n in batch.rooms[[place, place + 1, -1]])
-        if values.nbytes > end - begin:
-            return False
-        room = slots.array(slot, np.uint8, all_of_them)[begin : begin + values.nbytes]
+        self, places: Sequence[int], slots: SlotMap, pattern: FactorPattern, values: Sequence[NDArray[Any]],
+        seconds: float, remedy: str = "",
+    ) -> list[int]:  # fmt: skip
+        """Writes factors of one pattern into their rooms; returns the places of those that are too large for theirs.
+        Raises Refused if this answer is late."""
+        slot, every = self._batch.message.factor_slot, self._batch.rooms
+        rooms = every[np.add.outer(places, [0, 1])].tolist()
+        fits = [each.nbytes <= end - begin for each, (begin, end) in zip(values, rooms, strict=True)]
+        room = slots.array(slot, np.uint8, int(every[-1]))
         if not slots.is_current(slot):
             raise Refused("the slot for factors was lent to somebody else: this answer is late", "late")
-        np.copyto(room.view(values.dtype), values)
-        self._add(place, pattern.id, pattern.nonzeros, checksum(values), seconds, "", remedy)
-        return True
+        sources = list(compress(values, fits))
+        targets = [
+            room[begin : begin + each.nbytes] for each, (begin, _) in zip(sources, compress(rooms, fits), strict=True)
+        ]
+        sums, _ = native_copies().copy(sources, targets, own_sources=True)
+        for place, checksum in zip(compress(places, fits), sums, strict=True):
+            self._add(place, pattern.id, pattern.nonzeros, checksum, seconds, "", remedy)
+        return [place for place, fit in zip(places, fits, strict=True) if not fit]
 
     def add_failure(self, place: int, failure: str) -> None:
         """Adds why a job has no factor."""

@@ -6,7 +6,7 @@ import os
 import socket
 import sys
 from threading import Event
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -15,6 +15,9 @@ from precond_worker.errors import DeviceUnusable, NameTaken
 from protocol.process.command_line import Program, Terminated, end_in_order
 from protocol.process.exhausted import exhausted
 from protocol.process.nvidia import nvidia_device
+
+if TYPE_CHECKING:
+    from protocol.shared_memory.device_probe import OpenedMemory
 
 PROGRAM = Program("precond-worker")
 app = typer.Typer(pretty_exceptions_enable=False, rich_markup_mode=None)
@@ -157,6 +160,7 @@ def _serve(
     from protocol.network.identity import usual_identity
     from protocol.network.metrics_server import MetricsServer, metrics_address
     from protocol.network.session import Session
+    from protocol.process.memory import keep_long_lived
     from protocol.process.notify import Notifier
     from protocol.refused import Refused
 
@@ -190,8 +194,9 @@ def _serve(
 
     def connection(session: Session, server: str, wake: Event) -> ServerConnection:
         made = ServerConnection(
-            session, server, name, threads, shown, Counters(logging.getLogger("precond_worker")), wake
-        )
+            session, server, name, threads, shown, Counters(logging.getLogger("precond_worker")), wake,
+            opened_memory(library) if shared_memory else None,
+        )  # fmt: skip
         if collected is not None:
             collected.connections.append(made)
         return made
@@ -217,11 +222,21 @@ def _serve(
     with closing, MainLoop(
         where, shared_memory, connection, worker, identity, name, left, notifier.alive
     ) as serving:  # fmt: skip
+        keep_long_lived()
         notifier.ready(f"{shown}, looking for {', '.join(servers)}")
         try:
             serving.run()
         finally:
             notifier.stopping()
+
+
+def opened_memory(library: str) -> "OpenedMemory | None":
+    """Returns what opens device memory of servers; None: the library is one of the CPU."""
+    if not library.startswith("gpu"):
+        return None
+    from precond_worker.gpu.opened_memory import OpenedDeviceMemory
+
+    return OpenedDeviceMemory()
 
 
 def library_title(library: str) -> str:

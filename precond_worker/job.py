@@ -1,7 +1,9 @@
 # SPDX-License-Identifier: MIT
 """A job: a matrix or positions that were received, and checked before use."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from math import prod
 
 import numpy as np
@@ -10,7 +12,7 @@ import zenoh
 from precond_worker.arrays import Float64
 from precond_worker.batch import Batch, accept_batch
 from protocol.channels import CHANNELS, check_name, key, name_in
-from protocol.messages_pb2 import Matrix
+from protocol.messages_pb2 import Matrix, MatrixBatch
 from protocol.method import Method
 from protocol.refused import Refused
 from protocol.shared_memory.pool import HEADER
@@ -20,26 +22,49 @@ from protocol.validate import array, check_header, check_strings, checksum, pars
 DTYPES = ("float32", "float64")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Job:
-    """message: of the server; shared: the values came by reference; batch, place: it is one of several of a message."""
+    """A matrix, or positions, of an object.
 
-    message: Matrix
+    number: of the job, header.sequence of the matrix
+    dtype: of the factor
+    topology: checksum of that of the object; 0: not told
+    known_patterns: ids of those that the server has for its factors
+    shared: the values came by reference
+    batch, place: it is one of several of a message
+    """
+
+    object: str
+    epoch: int
+    number: int
+    blocks: int
+    dtype: str
+    topology: int
+    known_patterns: Sequence[int]
     payload: zenoh.ZBytes
     shared: bool
     method: Method
+    alone: Matrix | None = None
     batch: Batch | None = None
     place: int = 0
 
-    @property
-    def object(self) -> str:
-        """Name of the object."""
-        return self.message.header.object
+    @cached_property
+    def message(self) -> Matrix:
+        """The job as it came alone, or would have, then without slots."""
+        if self.alone is not None:
+            return self.alone
+        assert self.batch is not None
+        return self.batch.entry(self.place)
 
     @property
     def positions(self) -> bool:
         """True if the payload holds positions instead of a matrix."""
-        return self.message.nodes > 0
+        return self.alone is not None and self.alone.nodes > 0
+
+    @property
+    def on_device(self) -> bool:
+        """True if the matrix lies in device memory of the server."""
+        return self.alone is not None and self.alone.HasField("device_matrix")
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -69,23 +94,34 @@ class Job:
 def accept(sample: zenoh.Sample, server: str, worker: str, incarnation: int) -> list[Job]:
     """Checks a sample and returns its jobs; raises Refused."""
     if str(sample.key_expr) == key("matrices", server, worker=worker):
-        batch = accept_batch(sample, worker, incarnation)
-        entries = [batch.entry(place) for place in range(len(batch.message.jobs))]
-        return [
-            Job(entry, batch.payload, batch.shared, _method(entry), batch, place) for place, entry in enumerate(entries)
-        ]
+        return _jobs_of(accept_batch(sample, worker, incarnation))
     message = parse(Matrix, sample.attachment, CHANNELS["matrix"].limit)
     header = check_header(message, incarnation=incarnation)
     check_strings(message, 256)
+    check_name(header.object, "Matrix.header.object")
     if header.object != name_in("matrix", sample.key_expr, "object") or message.worker != worker:
         raise Refused(f"Matrix is for {message.worker!r}, its key is {sample.key_expr}", "worker")
-    shared = message.HasField("matrix_slot") and sample.payload.as_shm() is not None
-    return [Job(message, sample.payload, shared, _method(message))]
+    in_slot = message.HasField("matrix_slot") and sample.payload.as_shm() is not None
+    shared = in_slot or message.HasField("device_matrix")
+    told = header.object, header.epoch, header.sequence, message.blocks, message.factor_dtype, message.topology
+    return [Job(*told, message.known_patterns, sample.payload, shared, _method(message), message)]
 
 
-def _method(message: Matrix) -> Method:
-    """Returns how the factor is to be made; raises Refused."""
-    check_name(message.header.object, "Matrix.header.object")
+def _jobs_of(batch: Batch) -> list[Job]:
+    m, method = batch.message, _method(batch.message)
+    known = batch.known_patterns
+    columns = zip(
+        m.objects, m.epochs, m.jobs, m.blocks, m.topologies or [0] * len(m.jobs), known, range(len(known)), strict=True
+    )  # fmt: skip
+    dtype, values = m.factor_dtype, (batch.payload, batch.shared, method, None, batch)
+    return [
+        Job(check_name(name, "Matrix.header.object"), epoch, number, blocks, dtype, topology, patterns, *values, place)
+        for name, epoch, number, blocks, topology, patterns, place in columns
+    ]
+
+
+def _method(message: Matrix | MatrixBatch) -> Method:
+    """Returns how factors are to be made; raises Refused."""
     if message.factor_dtype not in DTYPES:
         raise Refused(f"Matrix.factor_dtype is {message.factor_dtype!r}; allowed: {', '.join(DTYPES)}", "malformed")
     return Method(message.method, message.drop_tolerance, message.fill, message.omega).check()

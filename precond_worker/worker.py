@@ -3,7 +3,9 @@
 
 import logging
 import time
+from collections import deque
 from collections.abc import Callable, Sequence
+from itertools import groupby
 from typing import Any, NamedTuple
 from weakref import WeakValueDictionary
 
@@ -11,17 +13,18 @@ import numpy as np
 import zenoh
 from numpy.typing import NDArray
 
-from precond_worker.arrays import Int32
+from precond_worker.arrays import Float64, Int32
 from precond_worker.batch import Batch, BatchAnswer
 from precond_worker.errors import DeviceUnusable, NameTaken
-from precond_worker.factorization.registry import Factorization
+from precond_worker.factorization.registry import DeviceFactorization, Factorization
 from precond_worker.job import Job, accept
 from precond_worker.network.presence import ServerGone, ServersThere
 from precond_worker.network.server_connection import ServerConnection
 from precond_worker.remote_assembly import Assemblers
+from precond_worker.symbolic.preparation import LEAST_NODES, objects_to_prepare
 from protocol.channels import WHOLE_PARTS
 from protocol.factor import FactorPattern
-from protocol.messages_pb2 import Factor
+from protocol.messages_pb2 import Factor, Topology
 from protocol.method import COMPLETE, Method
 from protocol.process.exhausted import exhausted
 from protocol.refused import Refused
@@ -55,7 +58,7 @@ class JobsTogether(NamedTuple):
 class Worker:
     """Does the jobs of one server: the object that waits longest first, of each the newest matrix; together with it
     those of other objects, where a library factorizes many matrices of one pattern at a time. While it does, the next
-    ones are made ready, and the last ones sent."""
+    ones are made ready, and the last ones sent. Before there is a job the symbolic phase of large objects is done."""
 
     def __init__(
         self, connection: ServerConnection, analyse: Analyse, on_server: Callable[[bool], None] = lambda found: None,
@@ -72,6 +75,7 @@ class Worker:
         self._assemblers = Assemblers(connection)
         self._pending: dict[str, Job] = {}
         self._under_way: JobsTogether | None = None
+        self._unprepared: deque[str | None] = deque()  # objects to be made ready for; None: the scene tells which
         self._last_end = 0.0  # when such jobs were done last [s]
         self._answers: dict[int, BatchAnswer] = {}  # by id of the batch; sent before a batch is forgotten
 
@@ -92,19 +96,47 @@ class Worker:
 
     @property
     def waiting(self) -> int:
-        """Number of jobs taken in and not done."""
-        return len(self._pending) + (0 if self._under_way is None else len(self._under_way.jobs))
+        """Number of jobs taken in and not done; 1 while there is something to prepare."""
+        jobs = len(self._pending) + (0 if self._under_way is None else len(self._under_way.jobs))
+        return jobs or min(len(self._unprepared), 1)
 
     def work(self) -> bool:
         """Does one job, or several of one pattern together; returns False if there is none."""
         if not self.waiting:
             return False
+        if self._unprepared and not self._pending and self._under_way is None:
+            self._prepare(self._unprepared.popleft())
+            self._done()
+            if not self._unprepared:
+                self._connection.tell()  # the server may wait for that
+            return True
         try:
             self._work()
         finally:
             self._send_answers()
         self._done()
         return True
+
+    def _prepare(self, object: str | None) -> None:
+        """Does the symbolic phase of an object, unless it is small; None: finds out of which it is to be done."""
+        connection, method = self._connection, Method()
+        try:
+            if object is None:
+                self._unprepared.extend(objects_to_prepare(connection.scene()))
+                return
+            topology = connection.topology(object)
+            if topology.nodes < LEAST_NODES:
+                return
+            analysis = self._analysis_of(object, topology, method)
+            connection.send_pattern(analysis.pattern, object, topology.header.epoch)
+            if (make_ready := getattr(analysis, "make_ready", None)) is not None:
+                make_ready()
+        except DeviceUnusable:
+            raise
+        except Exception as error:  # the first job will tell of it, if it is still so then
+            if exhausted(error) and not isinstance(error, MemoryError):
+                raise
+            log.debug("nothing is prepared: %s", error)
 
     def finish(self) -> None:
         """Waits for the jobs that are under way, and answers them."""
@@ -139,25 +171,27 @@ class Worker:
         """Takes the job that waits longest, and others that can be factorized together with it."""
         first = self._pending.pop(next(iter(self._pending)))
         shared = self._known_analysis(first)
-        most = getattr(shared, "most", 1) if self._pending else 1
+        most: int = getattr(shared, "most", 1)
+        if shared is not None:
+            self._connection.together = most
         jobs = [first]
         for name, job in list(self._pending.items()):
             if len(jobs) >= most:
                 break
-            alike = job.message.factor_dtype == first.message.factor_dtype and not (job.positions or first.positions)
+            alike = job.dtype == first.dtype and not any(j.positions or j.on_device for j in (job, first))
             if alike and self._known_analysis(job) is shared:
                 jobs.append(self._pending.pop(name))
         return jobs
 
     def _known_analysis(self, job: Job) -> Factorization | None:
         """Returns the symbolic phase of a job, if it is done already."""
-        key, epoch = (job.object, job.method.name), job.message.header.epoch
+        key, epoch = (job.object, job.method.name), job.epoch
         known = self._analyses.get(key)
         if known is not None and (known.epoch, known.method) == (epoch, job.method):
             return known.factorization
-        alike = self._complete.get(job.message.topology) if job.method.name == COMPLETE else None
+        alike = self._complete.get(job.topology) if job.method.name == COMPLETE else None
         if alike is not None:
-            self._analyses[key] = CachedAnalysis(epoch, job.method, self._blocks[job.message.topology], alike)
+            self._analyses[key] = CachedAnalysis(epoch, job.method, self._blocks[job.topology], alike)
         return alike
 
     def _begin_together(self, jobs: Sequence[Job]) -> JobsTogether | None:
@@ -168,14 +202,23 @@ class Worker:
             for job in jobs:
                 self._analysis(job)  # the number of blocks is right
             begun = time.perf_counter()
-            values = [job.values(self._connection.slots) for job in jobs]
-            end = analysis.begin_many(values, np.dtype(jobs[0].message.factor_dtype))
+            end = analysis.begin_many(self._matrices(jobs), np.dtype(jobs[0].dtype))
         except DeviceUnusable as error:
             self._give_up(jobs, error)
             raise
         except (Refused, ValueError, MemoryError):
             return None
         return None if end is None else JobsTogether(jobs, analysis, end, begun)
+
+    def _matrices(self, jobs: Sequence[Job]) -> list[Float64]:
+        """Returns the matrices of jobs; raises Refused."""
+        slots, found = self._connection.slots, []
+        for batch, group in groupby(jobs, lambda job: job.batch):
+            if batch is None:
+                found += [job.values(slots) for job in group]
+            else:
+                found += batch.matrices([job.place for job in group], slots)
+        return found
 
     def _give_up(self, jobs: Sequence[Job], error: DeviceUnusable) -> None:
         waiting = self._under_way.jobs if self._under_way else ()
@@ -197,16 +240,32 @@ class Worker:
         now = time.perf_counter()
         seconds = (now - max(together.begun, self._last_end)) / len(jobs)  # not what was made before these
         self._last_end = now
-        for job, factor in zip(jobs, factors, strict=True):
-            self._count(job)
-            self._on_factorization(seconds)
+        made = zip(jobs, factors, strict=True)
+        for _, group in groupby(made, lambda each: each[0].batch or each[0]):
+            answered, values = zip(*group, strict=True)
+            self._count(answered)
+            for _ in answered:
+                self._on_factorization(seconds)
             try:
-                self._send_pattern(job, analysis.pattern)
-                self._answer(job, analysis.pattern, factor, seconds)
-            except Refused as refusal:  # its slot was lent to somebody else
+                self._answer_all(answered, analysis.pattern, values, seconds)
+            except Refused as refusal:  # their slot was lent to somebody else
                 self._counters.refuse(refusal)
             except zenoh.ZError as error:
                 self._counters.trouble("unsent", f"a factor was not sent: {error}")
+
+    def _answer_all(
+        self, jobs: Sequence[Job], pattern: FactorPattern, values: Sequence[NDArray[Any]], seconds: float
+    ) -> None:  # fmt: skip
+        """Answers jobs of one message, or one that came alone, with factors that were made together."""
+        for job in jobs:
+            self._send_pattern(job, pattern)
+        alone, batch = [job.place for job in jobs], jobs[0].batch
+        if batch is not None:
+            alone = self._answers_to(batch).add(alone, self._connection.slots, pattern, values, seconds)
+            self._counters.add("factors", len(jobs) - len(alone))
+        for job, factor in zip(jobs, values, strict=True):
+            if job.place in alone:
+                self._answer_alone(job, pattern, factor, seconds)
 
     def _done(self) -> None:
         if not self.waiting:
@@ -245,9 +304,11 @@ class Worker:
                 self._forget()
                 self._connection.follow(incarnation)
                 self._on_server(True)
+                self._unprepared.append(None)
                 return
 
     def _forget(self) -> None:
+        self._unprepared.clear()
         self._counters.add("superseded", self.waiting)
         self._pending.clear()
         under_way, self._under_way = self._under_way, None
@@ -261,19 +322,22 @@ class Worker:
         waiting = self._pending.get(job.object)
         if waiting is not None:
             self._counters.add("superseded")
-            if waiting.message.header.sequence >= job.message.header.sequence:
+            if waiting.number >= job.number:
                 return
         self._pending[job.object] = job
 
-    def _count(self, job: Job) -> None:
-        self._connection.offered.withdraw(job.object)  # the server has the last one, or has given it up
-        self._counters.add("jobs")
-        self._counters.add("bulk_shared" if job.shared else "bulk_copied")
-        if (job.batch is not None or job.message.HasField("matrix_slot")) and not job.shared:
+    def _count(self, jobs: Sequence[Job]) -> None:
+        """Counts jobs of one message, whose values came alike."""
+        for job in jobs:
+            self._connection.offered.withdraw(job.object)  # the server has the last one, or has given it up
+        first = jobs[0]
+        self._counters.add("jobs", len(jobs))
+        self._counters.add("bulk_shared" if first.shared else "bulk_copied", len(jobs))
+        if (first.batch is not None or first.message.HasField("matrix_slot")) and not first.shared:
             self._counters.warn("copied", "a matrix came as a copy although shared memory was tried and found to work")
 
     def _do(self, job: Job) -> None:
-        self._count(job)
+        self._count([job])
         try:
             self._factorize(job)
         except Refused as refusal:
@@ -298,7 +362,12 @@ class Worker:
     def _factorize(self, job: Job) -> None:
         message = job.message
         analysis = self._analysis(job)
-        values = job.values(self._connection.slots)
+        if job.on_device:
+            values = self._factorize_on_device(job, analysis)
+            if values is None:
+                return
+        else:
+            values = job.values(self._connection.slots)
         assembler = self._assemblers.of(job.object, message.header.epoch) if job.positions else None
         complete = job.method.name == COMPLETE  # its pattern is known beforehand
         if complete:  # so that the server can prepare for it meanwhile
@@ -314,26 +383,58 @@ class Worker:
             self._send_pattern(job, analysis.pattern)
         self._answer(job, analysis.pattern, factor, seconds, remedy=analysis.remedy)
 
+    def _factorize_on_device(self, job: Job, analysis: Factorization) -> Float64 | None:
+        """Factorizes a matrix in device memory of the server, where L is written, too, and answers. Returns the matrix
+        if that must be done on the host: it may need a remedy."""
+        message, device, connection = job.message, self._connection.device, self._connection
+        dtype, size = np.dtype(message.factor_dtype), 72 * message.blocks
+        try:
+            if device is None:
+                raise Refused("Matrix.device_matrix is set, but this worker opens no device memory", "slot")
+            matrix = device.address(message.device_matrix, size)
+            room = message.device_factor.capacity
+            target = device.address(message.device_factor, min(room, analysis.pattern.nonzeros * dtype.itemsize))
+        except Refused as refusal:
+            connection.leave_device(str(refusal))
+            raise
+        self._send_pattern(job, analysis.pattern)
+        begin, copy = time.perf_counter(), None
+        if analysis.pattern.nonzeros * dtype.itemsize <= room and isinstance(analysis, DeviceFactorization):
+            copy = analysis.factorize_on_device(matrix, dtype)
+        if copy is None:
+            return device.read(matrix, np.dtype(np.float64), size // 8).reshape(job.shape)
+        seconds = time.perf_counter() - begin
+        self._on_factorization(seconds)
+        if not device.is_current(message.device_factor):
+            raise Refused("the slot for the factor was lent to somebody else: this answer is late", "late")
+        copy(target)
+        self._answer(job, analysis.pattern, None, seconds)
+        return None
+
     def _send_pattern(self, job: Job, pattern: FactorPattern) -> None:
         """Sends the pattern of L if the server does not know it."""
-        if pattern.id not in job.message.known_patterns:
-            self._connection.send_pattern(pattern, job.object, job.message.header.epoch)
+        if pattern.id not in job.known_patterns:
+            self._connection.send_pattern(pattern, job.object, job.epoch)
 
     def _analysis(self, job: Job) -> Factorization:
         """Returns the symbolic phase, done once per epoch of an object."""
-        object, epoch, blocks = job.object, job.message.header.epoch, job.message.blocks
+        object, epoch, blocks = job.object, job.epoch, job.blocks
         if self._known_analysis(job) is None:
-            topology = self._connection.topology(object, epoch)
-            row_start = array(topology.row_start, np.int32, (topology.nodes + 1,), "Topology.row_start")
-            columns = array(topology.columns, np.int32, (-1,), "Topology.columns")
-            analysis = self._shared(topology_checksum(topology), row_start, columns, job.method)
-            self._analyses[object, job.method.name] = CachedAnalysis(epoch, job.method, len(columns), analysis)
-            if job.method.name == COMPLETE:  # by one of several libraries
-                self._connection.library = analysis.library
+            self._analysis_of(object, self._connection.topology(object, epoch), job.method)
         known = self._analyses[object, job.method.name]
         if known.blocks != blocks:
             raise Refused(f"Matrix.blocks is {blocks}; allowed: {known.blocks}, as in the topology", "shape")
         return known.factorization
+
+    def _analysis_of(self, object: str, topology: Topology, method: Method) -> Factorization:
+        """Does the symbolic phase of an object, unless one like it has had it."""
+        row_start = array(topology.row_start, np.int32, (topology.nodes + 1,), "Topology.row_start")
+        columns = array(topology.columns, np.int32, (-1,), "Topology.columns")
+        analysis = self._shared(topology_checksum(topology), row_start, columns, method)
+        self._analyses[object, method.name] = CachedAnalysis(topology.header.epoch, method, len(columns), analysis)
+        if method.name == COMPLETE:  # by one of several libraries
+            self._connection.library = analysis.library
+        return analysis
 
     def _shared(self, topology: int, row_start: Int32, columns: Int32, method: Method) -> Factorization:
         """Returns the symbolic phase of a pattern; objects of one topology (its checksum) share that of complete
@@ -348,17 +449,25 @@ class Worker:
         return known
 
     def _answer(
-        self,
-        job: Job,
-        pattern: FactorPattern | None = None,
-        values: NDArray[Any] | None = None,
-        seconds: float = 0.0,
-        failure: str = "",
-        remedy: str = "",
-    ) -> None:
+        self, job: Job, pattern: FactorPattern | None = None, values: NDArray[Any] | None = None, seconds: float = 0.0,
+        failure: str = "", remedy: str = "",
+    ) -> None:  # fmt: skip
+        """Answers a job, with others of its message where its factor fits into its room there."""
+        if job.batch is None:
+            return self._answer_alone(job, pattern, values, seconds, failure, remedy)
+        answers = self._answers_to(job.batch)
+        if pattern is None or values is None:
+            answers.add_failure(job.place, failure[:500])
+        elif answers.add([job.place], self._connection.slots, pattern, [values], seconds, remedy):
+            self._answer_alone(job, pattern, values, seconds, failure, remedy)
+        else:
+            self._counters.add("factors")
+
+    def _answer_alone(
+        self, job: Job, pattern: FactorPattern | None, values: NDArray[Any] | None, seconds: float,
+        failure: str = "", remedy: str = "",
+    ) -> None:  # fmt: skip
         message, connection = job.message, self._connection
-        if job.batch is not None and self._answer_together(job, job.batch, pattern, values, seconds, failure, remedy):
-            return
         answer = Factor(
             header=connection.header(job.object, message.header.epoch, "factor"),
             step=message.step,
@@ -372,8 +481,11 @@ class Worker:
             matrix_shared=job.shared,
         )
         payload = b""
-        if pattern is not None and values is not None:
+        if pattern is not None:
             answer.pattern, answer.nonzeros = pattern.id, pattern.nonzeros
+        if pattern is not None and values is None:  # they are in the slot already
+            answer.device_slot.CopyFrom(message.device_factor)
+        elif pattern is not None and values is not None:
             if self._into_slot(message, answer, values):
                 pass
             elif 0 < WHOLE_PARTS * message.part_bytes < values.nbytes:
@@ -383,23 +495,15 @@ class Worker:
                 answer.checksum = checksum(values)
                 payload = values.tobytes()
         connection.send_factor(answer, payload)
-        if values is not None:
+        if pattern is not None:
             self._counters.add("factors")
 
-    def _answer_together(
-        self, job: Job, batch: Batch, pattern: FactorPattern | None, values: NDArray[Any] | None, seconds: float,
-        failure: str, remedy: str,
-    ) -> bool:  # fmt: skip
-        """Adds an answer to those that leave together; False if the factor does not fit into its room."""
-        answer = self._answers.get(id(batch))
-        if answer is None:
+    def _answers_to(self, batch: Batch) -> BatchAnswer:
+        """Returns the answers to jobs of a message that leave together."""
+        if id(batch) not in self._answers:
             connection = self._connection
-            answer = BatchAnswer(batch, connection.header("", 0, "factors"), connection.name)
-            self._answers[id(batch)] = answer
-        if pattern is None or values is None:
-            answer.add_failure(job.place, failure[:500])
-            return True
-        return answer.add(job.place, self._connection.slots, pattern, values, seconds, remedy)
+            self._answers[id(batch)] = BatchAnswer(batch, connection.header("", 0, "factors"), connection.name)
+        return self._answers[id(batch)]
 
     def _send_answers(self) -> None:
         answers, self._answers = self._answers, {}

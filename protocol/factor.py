@@ -16,6 +16,7 @@ from protocol.validate import all_finite, array, check_range, checksum
 
 __all__ = ["Factor", "FactorPattern", "Refused", "check_values", "pattern_id"]
 
+ROOM_ALIGNMENT = 64  # bytes to which the room of a factor in the slot of a batch is rounded up
 MOST_VALUES = (1 << 31) - 1  # of a factor, 8 GiB in float32: what a pattern may make its receiver prepare for
 
 Int32 = NDArray[np.int32]
@@ -181,13 +182,20 @@ class Factor:
     later: bool = False
     method: str = ""
 
+    def checksum(self) -> int:
+        """Returns xxh3_64 of the values."""
+        told = getattr(self.values, "checksum", None)  # of values on a device
+        return int(checksum(self.values) if told is None else told())
+
 
 def check_values(
-    values: NDArray[Any], pattern: FactorPattern, expected: int | None, seen: tuple[int, bool] | None = None
+    values: NDArray[Any], pattern: FactorPattern, expected: int | None, seen: tuple[int, bool] | None = None,
+    positive: bool | None = None,
 ) -> None:  # fmt: skip
     """Raises Refused unless values are a factor of this pattern with this checksum: finite, diagonal positive.
 
     seen: checksum of the values and whether all are finite, where that is known already (validate.copied)
+    positive: whether the diagonal is, where that is known already
     """
     if values.shape != (pattern.nonzeros,) or values.dtype not in (np.float32, np.float64):
         raise Refused(
@@ -199,5 +207,5 @@ def check_values(
         raise Refused("Factor.checksum does not match the values", "checksum")
     if not (all_finite(values) if seen is None else seen[1]):
         raise Refused("Factor values hold NaN or infinite numbers; allowed: finite", "not_finite")
-    if not (values[pattern.diagonal] > 0).all():
+    if not ((values[pattern.diagonal] > 0).all() if positive is None else positive):
         raise Refused("Factor values: a diagonal entry of L is not positive", "not_positive")

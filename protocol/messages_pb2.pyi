@@ -65,6 +65,16 @@ class Slot(_message.Message):
     generation: int
     def __init__(self, segment: _Optional[str] = ..., offset: _Optional[int] = ..., capacity: _Optional[int] = ..., generation: _Optional[int] = ...) -> None: ...
 
+class DeviceSlot(_message.Message):
+    __slots__ = ("handle", "capacity", "generation")
+    HANDLE_FIELD_NUMBER: _ClassVar[int]
+    CAPACITY_FIELD_NUMBER: _ClassVar[int]
+    GENERATION_FIELD_NUMBER: _ClassVar[int]
+    handle: bytes
+    capacity: int
+    generation: int
+    def __init__(self, handle: _Optional[bytes] = ..., capacity: _Optional[int] = ..., generation: _Optional[int] = ...) -> None: ...
+
 class Scene(_message.Message):
     __slots__ = ("header", "name", "toml", "resolved", "dt", "started_ns", "software", "objects", "server", "device", "build", "obstacles")
     HEADER_FIELD_NUMBER: _ClassVar[int]
@@ -146,7 +156,7 @@ class Group(_message.Message):
     def __init__(self, name: _Optional[str] = ..., elements: _Optional[bytes] = ..., faces: _Optional[bytes] = ..., nodes: _Optional[bytes] = ...) -> None: ...
 
 class Matrix(_message.Message):
-    __slots__ = ("header", "step", "warp", "blocks", "checksum", "factor_dtype", "method", "known_patterns", "lease", "factor_slot", "matrix_slot", "worker", "drop_tolerance", "fill", "omega", "nodes", "part_bytes", "topology")
+    __slots__ = ("header", "step", "warp", "blocks", "checksum", "factor_dtype", "method", "known_patterns", "lease", "factor_slot", "matrix_slot", "worker", "drop_tolerance", "fill", "omega", "nodes", "part_bytes", "topology", "device_matrix", "device_factor")
     HEADER_FIELD_NUMBER: _ClassVar[int]
     STEP_FIELD_NUMBER: _ClassVar[int]
     WARP_FIELD_NUMBER: _ClassVar[int]
@@ -165,6 +175,8 @@ class Matrix(_message.Message):
     NODES_FIELD_NUMBER: _ClassVar[int]
     PART_BYTES_FIELD_NUMBER: _ClassVar[int]
     TOPOLOGY_FIELD_NUMBER: _ClassVar[int]
+    DEVICE_MATRIX_FIELD_NUMBER: _ClassVar[int]
+    DEVICE_FACTOR_FIELD_NUMBER: _ClassVar[int]
     header: Header
     step: int
     warp: bool
@@ -183,7 +195,9 @@ class Matrix(_message.Message):
     nodes: int
     part_bytes: int
     topology: int
-    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., step: _Optional[int] = ..., warp: _Optional[bool] = ..., blocks: _Optional[int] = ..., checksum: _Optional[int] = ..., factor_dtype: _Optional[str] = ..., method: _Optional[str] = ..., known_patterns: _Optional[_Iterable[int]] = ..., lease: _Optional[float] = ..., factor_slot: _Optional[_Union[Slot, _Mapping]] = ..., matrix_slot: _Optional[_Union[Slot, _Mapping]] = ..., worker: _Optional[str] = ..., drop_tolerance: _Optional[float] = ..., fill: _Optional[float] = ..., omega: _Optional[float] = ..., nodes: _Optional[int] = ..., part_bytes: _Optional[int] = ..., topology: _Optional[int] = ...) -> None: ...
+    device_matrix: DeviceSlot
+    device_factor: DeviceSlot
+    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., step: _Optional[int] = ..., warp: _Optional[bool] = ..., blocks: _Optional[int] = ..., checksum: _Optional[int] = ..., factor_dtype: _Optional[str] = ..., method: _Optional[str] = ..., known_patterns: _Optional[_Iterable[int]] = ..., lease: _Optional[float] = ..., factor_slot: _Optional[_Union[Slot, _Mapping]] = ..., matrix_slot: _Optional[_Union[Slot, _Mapping]] = ..., worker: _Optional[str] = ..., drop_tolerance: _Optional[float] = ..., fill: _Optional[float] = ..., omega: _Optional[float] = ..., nodes: _Optional[int] = ..., part_bytes: _Optional[int] = ..., topology: _Optional[int] = ..., device_matrix: _Optional[_Union[DeviceSlot, _Mapping]] = ..., device_factor: _Optional[_Union[DeviceSlot, _Mapping]] = ...) -> None: ...
 
 class FactorPattern(_message.Message):
     __slots__ = ("header", "id", "size", "supernodes", "nonzeros", "permutation", "super_start", "row_start", "rows")
@@ -208,7 +222,7 @@ class FactorPattern(_message.Message):
     def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., id: _Optional[int] = ..., size: _Optional[int] = ..., supernodes: _Optional[int] = ..., nonzeros: _Optional[int] = ..., permutation: _Optional[bytes] = ..., super_start: _Optional[bytes] = ..., row_start: _Optional[bytes] = ..., rows: _Optional[bytes] = ...) -> None: ...
 
 class Factor(_message.Message):
-    __slots__ = ("header", "step", "warp", "pattern", "dtype", "nonzeros", "checksum", "slot", "worker", "seconds", "failure", "job", "matrix_shared", "remedy", "parts")
+    __slots__ = ("header", "step", "warp", "pattern", "dtype", "nonzeros", "checksum", "slot", "worker", "seconds", "failure", "job", "matrix_shared", "remedy", "device_slot", "parts")
     HEADER_FIELD_NUMBER: _ClassVar[int]
     STEP_FIELD_NUMBER: _ClassVar[int]
     WARP_FIELD_NUMBER: _ClassVar[int]
@@ -223,6 +237,7 @@ class Factor(_message.Message):
     JOB_FIELD_NUMBER: _ClassVar[int]
     MATRIX_SHARED_FIELD_NUMBER: _ClassVar[int]
     REMEDY_FIELD_NUMBER: _ClassVar[int]
+    DEVICE_SLOT_FIELD_NUMBER: _ClassVar[int]
     PARTS_FIELD_NUMBER: _ClassVar[int]
     header: Header
     step: int
@@ -238,8 +253,9 @@ class Factor(_message.Message):
     job: int
     matrix_shared: bool
     remedy: str
+    device_slot: DeviceSlot
     parts: _containers.RepeatedScalarFieldContainer[int]
-    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., step: _Optional[int] = ..., warp: _Optional[bool] = ..., pattern: _Optional[int] = ..., dtype: _Optional[str] = ..., nonzeros: _Optional[int] = ..., checksum: _Optional[int] = ..., slot: _Optional[_Union[Slot, _Mapping]] = ..., worker: _Optional[str] = ..., seconds: _Optional[float] = ..., failure: _Optional[str] = ..., job: _Optional[int] = ..., matrix_shared: _Optional[bool] = ..., remedy: _Optional[str] = ..., parts: _Optional[_Iterable[int]] = ...) -> None: ...
+    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., step: _Optional[int] = ..., warp: _Optional[bool] = ..., pattern: _Optional[int] = ..., dtype: _Optional[str] = ..., nonzeros: _Optional[int] = ..., checksum: _Optional[int] = ..., slot: _Optional[_Union[Slot, _Mapping]] = ..., worker: _Optional[str] = ..., seconds: _Optional[float] = ..., failure: _Optional[str] = ..., job: _Optional[int] = ..., matrix_shared: _Optional[bool] = ..., remedy: _Optional[str] = ..., device_slot: _Optional[_Union[DeviceSlot, _Mapping]] = ..., parts: _Optional[_Iterable[int]] = ...) -> None: ...
 
 class FactorPart(_message.Message):
     __slots__ = ("header", "job", "number", "slot")
@@ -326,7 +342,7 @@ class FactorBatch(_message.Message):
     def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., worker: _Optional[str] = ..., jobs: _Optional[_Iterable[int]] = ..., patterns: _Optional[_Iterable[int]] = ..., nonzeros: _Optional[_Iterable[int]] = ..., checksums: _Optional[_Iterable[int]] = ..., seconds: _Optional[_Iterable[float]] = ..., failures: _Optional[_Iterable[str]] = ..., remedies: _Optional[_Iterable[str]] = ..., slot: _Optional[_Union[Slot, _Mapping]] = ..., matrix_shared: _Optional[bool] = ...) -> None: ...
 
 class WorkerInfo(_message.Message):
-    __slots__ = ("header", "worker", "pid", "host", "library", "threads", "shared_memory", "jobs", "failures", "superseded", "refused", "bulk_shared", "bulk_copied", "builds", "idle", "share", "leaving", "most_jobs", "batches")
+    __slots__ = ("header", "worker", "pid", "host", "library", "threads", "shared_memory", "jobs", "failures", "superseded", "refused", "bulk_shared", "bulk_copied", "builds", "idle", "share", "leaving", "most_jobs", "batches", "together", "device_memory")
     HEADER_FIELD_NUMBER: _ClassVar[int]
     WORKER_FIELD_NUMBER: _ClassVar[int]
     PID_FIELD_NUMBER: _ClassVar[int]
@@ -346,6 +362,8 @@ class WorkerInfo(_message.Message):
     LEAVING_FIELD_NUMBER: _ClassVar[int]
     MOST_JOBS_FIELD_NUMBER: _ClassVar[int]
     BATCHES_FIELD_NUMBER: _ClassVar[int]
+    TOGETHER_FIELD_NUMBER: _ClassVar[int]
+    DEVICE_MEMORY_FIELD_NUMBER: _ClassVar[int]
     header: Header
     worker: str
     pid: int
@@ -365,7 +383,9 @@ class WorkerInfo(_message.Message):
     leaving: bool
     most_jobs: int
     batches: bool
-    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., worker: _Optional[str] = ..., pid: _Optional[int] = ..., host: _Optional[str] = ..., library: _Optional[str] = ..., threads: _Optional[int] = ..., shared_memory: _Optional[bool] = ..., jobs: _Optional[int] = ..., failures: _Optional[int] = ..., superseded: _Optional[int] = ..., refused: _Optional[int] = ..., bulk_shared: _Optional[int] = ..., bulk_copied: _Optional[int] = ..., builds: _Optional[bool] = ..., idle: _Optional[bool] = ..., share: _Optional[float] = ..., leaving: _Optional[bool] = ..., most_jobs: _Optional[int] = ..., batches: _Optional[bool] = ...) -> None: ...
+    together: int
+    device_memory: bool
+    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., worker: _Optional[str] = ..., pid: _Optional[int] = ..., host: _Optional[str] = ..., library: _Optional[str] = ..., threads: _Optional[int] = ..., shared_memory: _Optional[bool] = ..., jobs: _Optional[int] = ..., failures: _Optional[int] = ..., superseded: _Optional[int] = ..., refused: _Optional[int] = ..., bulk_shared: _Optional[int] = ..., bulk_copied: _Optional[int] = ..., builds: _Optional[bool] = ..., idle: _Optional[bool] = ..., share: _Optional[float] = ..., leaving: _Optional[bool] = ..., most_jobs: _Optional[int] = ..., batches: _Optional[bool] = ..., together: _Optional[int] = ..., device_memory: _Optional[bool] = ...) -> None: ...
 
 class Need(_message.Message):
     __slots__ = ("header", "lost", "workers")
@@ -378,16 +398,20 @@ class Need(_message.Message):
     def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., lost: _Optional[float] = ..., workers: _Optional[float] = ...) -> None: ...
 
 class Echo(_message.Message):
-    __slots__ = ("header", "slot", "nonce", "settled")
+    __slots__ = ("header", "slot", "nonce", "settled", "on_device", "device")
     HEADER_FIELD_NUMBER: _ClassVar[int]
     SLOT_FIELD_NUMBER: _ClassVar[int]
     NONCE_FIELD_NUMBER: _ClassVar[int]
     SETTLED_FIELD_NUMBER: _ClassVar[int]
+    ON_DEVICE_FIELD_NUMBER: _ClassVar[int]
+    DEVICE_FIELD_NUMBER: _ClassVar[int]
     header: Header
     slot: Slot
     nonce: int
     settled: bool
-    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., slot: _Optional[_Union[Slot, _Mapping]] = ..., nonce: _Optional[int] = ..., settled: _Optional[bool] = ...) -> None: ...
+    on_device: bool
+    device: DeviceSlot
+    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., slot: _Optional[_Union[Slot, _Mapping]] = ..., nonce: _Optional[int] = ..., settled: _Optional[bool] = ..., on_device: _Optional[bool] = ..., device: _Optional[_Union[DeviceSlot, _Mapping]] = ...) -> None: ...
 
 class ObjectStep(_message.Message):
     __slots__ = ("header", "step", "time", "iterations", "residual", "status", "factor_step", "factor_age", "preconditioner", "assemble_seconds", "solve_seconds", "integrate_seconds", "step_seconds", "late_seconds", "cpu_seconds", "fallbacks", "excess", "interactions", "asked", "probe", "factor_age_bound", "linearizations", "nonlinear_residual", "kinetic_energy", "elastic_energy", "gravity_energy", "work", "dissipated", "form", "estimate", "contacts", "passes", "clipped", "contact_residual", "substeps", "halvings", "at_rest", "stable_step", "solve_error", "step_error", "readings", "left_out", "reactions")
@@ -902,7 +926,7 @@ class LocalWorker(_message.Message):
     def __init__(self, worker: _Optional[str] = ..., state: _Optional[str] = ..., pid: _Optional[int] = ..., restarts: _Optional[int] = ..., exit_code: _Optional[int] = ...) -> None: ...
 
 class Status(_message.Message):
-    __slots__ = ("header", "scene", "state", "step", "time", "dt", "step_p50", "step_p99", "step_max", "late_steps", "objects", "workers", "clients", "bulk_shared", "bulk_copied", "refused", "frames_dropped", "device", "pid", "uptime", "records_dropped", "records_thinned", "records_lost", "recording_failure", "commands_refused", "moves_replaced", "bulk_bytes_out", "bulk_bytes_in", "local_workers", "obstacles", "pace")
+    __slots__ = ("header", "scene", "state", "step", "time", "dt", "step_p50", "step_p99", "step_max", "late_steps", "objects", "workers", "clients", "bulk_shared", "bulk_copied", "bulk_on_device", "refused", "frames_dropped", "device", "pid", "uptime", "records_dropped", "records_thinned", "records_lost", "recording_failure", "commands_refused", "moves_replaced", "bulk_bytes_out", "bulk_bytes_in", "local_workers", "obstacles", "pace")
     HEADER_FIELD_NUMBER: _ClassVar[int]
     SCENE_FIELD_NUMBER: _ClassVar[int]
     STATE_FIELD_NUMBER: _ClassVar[int]
@@ -918,6 +942,7 @@ class Status(_message.Message):
     CLIENTS_FIELD_NUMBER: _ClassVar[int]
     BULK_SHARED_FIELD_NUMBER: _ClassVar[int]
     BULK_COPIED_FIELD_NUMBER: _ClassVar[int]
+    BULK_ON_DEVICE_FIELD_NUMBER: _ClassVar[int]
     REFUSED_FIELD_NUMBER: _ClassVar[int]
     FRAMES_DROPPED_FIELD_NUMBER: _ClassVar[int]
     DEVICE_FIELD_NUMBER: _ClassVar[int]
@@ -949,6 +974,7 @@ class Status(_message.Message):
     clients: _containers.RepeatedScalarFieldContainer[str]
     bulk_shared: int
     bulk_copied: int
+    bulk_on_device: int
     refused: int
     frames_dropped: int
     device: str
@@ -965,4 +991,4 @@ class Status(_message.Message):
     local_workers: _containers.RepeatedCompositeFieldContainer[LocalWorker]
     obstacles: _containers.RepeatedCompositeFieldContainer[ObstaclePose]
     pace: str
-    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., scene: _Optional[str] = ..., state: _Optional[str] = ..., step: _Optional[int] = ..., time: _Optional[float] = ..., dt: _Optional[float] = ..., step_p50: _Optional[float] = ..., step_p99: _Optional[float] = ..., step_max: _Optional[float] = ..., late_steps: _Optional[int] = ..., objects: _Optional[_Iterable[_Union[ObjectStatus, _Mapping]]] = ..., workers: _Optional[_Iterable[_Union[WorkerInfo, _Mapping]]] = ..., clients: _Optional[_Iterable[str]] = ..., bulk_shared: _Optional[int] = ..., bulk_copied: _Optional[int] = ..., refused: _Optional[int] = ..., frames_dropped: _Optional[int] = ..., device: _Optional[str] = ..., pid: _Optional[int] = ..., uptime: _Optional[float] = ..., records_dropped: _Optional[int] = ..., records_thinned: _Optional[int] = ..., records_lost: _Optional[int] = ..., recording_failure: _Optional[str] = ..., commands_refused: _Optional[int] = ..., moves_replaced: _Optional[int] = ..., bulk_bytes_out: _Optional[int] = ..., bulk_bytes_in: _Optional[int] = ..., local_workers: _Optional[_Iterable[_Union[LocalWorker, _Mapping]]] = ..., obstacles: _Optional[_Iterable[_Union[ObstaclePose, _Mapping]]] = ..., pace: _Optional[str] = ...) -> None: ...
+    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., scene: _Optional[str] = ..., state: _Optional[str] = ..., step: _Optional[int] = ..., time: _Optional[float] = ..., dt: _Optional[float] = ..., step_p50: _Optional[float] = ..., step_p99: _Optional[float] = ..., step_max: _Optional[float] = ..., late_steps: _Optional[int] = ..., objects: _Optional[_Iterable[_Union[ObjectStatus, _Mapping]]] = ..., workers: _Optional[_Iterable[_Union[WorkerInfo, _Mapping]]] = ..., clients: _Optional[_Iterable[str]] = ..., bulk_shared: _Optional[int] = ..., bulk_copied: _Optional[int] = ..., bulk_on_device: _Optional[int] = ..., refused: _Optional[int] = ..., frames_dropped: _Optional[int] = ..., device: _Optional[str] = ..., pid: _Optional[int] = ..., uptime: _Optional[float] = ..., records_dropped: _Optional[int] = ..., records_thinned: _Optional[int] = ..., records_lost: _Optional[int] = ..., recording_failure: _Optional[str] = ..., commands_refused: _Optional[int] = ..., moves_replaced: _Optional[int] = ..., bulk_bytes_out: _Optional[int] = ..., bulk_bytes_in: _Optional[int] = ..., local_workers: _Optional[_Iterable[_Union[LocalWorker, _Mapping]]] = ..., obstacles: _Optional[_Iterable[_Union[ObstaclePose, _Mapping]]] = ..., pace: _Optional[str] = ...) -> None: ...

@@ -14,6 +14,7 @@ import typer
 
 from protocol.network.endpoints import default_endpoint
 from protocol.process.command_line import Program, Terminated, end_in_order
+from protocol.process.memory import keep_long_lived
 from protocol.process.notify import Notifier
 from sim_server.errors import DeviceLost, InputError
 from sim_server.service.compile_notice import compile_notices
@@ -50,6 +51,7 @@ Examples:
 """
 
 WORKER_TIMEOUT = 15.0  # s that the start waits for the first local worker, at most
+READY_TIMEOUT = 3.0  # s that it then waits until worker and device are ready for the first factors, at most
 
 
 def list_gallery(asked: bool) -> None:
@@ -61,16 +63,17 @@ def list_gallery(asked: bool) -> None:
 
     from sim_server.scene import gallery, load
 
-    table = Table("name", "what", "elements", "command", box=None, pad_edge=False)
-    table.columns[2].justify, table.columns[3].no_wrap = "right", True
+    table = Table("name", "what", "elements", box=None, pad_edge=False)
+    table.columns[0].no_wrap, table.columns[2].justify = True, "right"
     for name in gallery.names():
         file = gallery.FOLDER / f"{name}.toml"
         try:
             elements = sum(len(o.load_mesh().tets) for o in load(file).objects)
         except InputError as error:
             PROGRAM.bad_input(f"{file}: {error}")
-        table.add_row(name, gallery.sentence(name), str(elements), f"sim-server {gallery.name_of(file)} --workers 1")
+        table.add_row(str(gallery.name_of(file)), gallery.sentence(name), str(elements))
     Console().print(table)
+    print("\nTo run one in a browser: sim-server NAME --workers 1 --web")
     raise typer.Exit
 
 
@@ -194,6 +197,7 @@ def run(o: Options, say: Callable[[str], None]) -> int:
             service.say = say
             announce(say, service, o.scene, o.listen or [default_endpoint(o.tls is not None)])
             wait_for_workers(service, supervisor)
+            keep_long_lived()
             describe_objects(say, service, o.listen, o.tls)
             service.health.notifier = notifier
             notifier.ready(f"{o.scene.name} on {', '.join(o.listen or ['loopback'])}")
@@ -239,12 +243,18 @@ def explain_scene(scene: Path, overrides: list[str], device: str, name: str, jso
 
 
 def wait_for_workers(service: "Service", supervisor: "Supervisor | None") -> None:
-    """Waits for the first local worker, WORKER_TIMEOUT at most."""
-    end = time.monotonic() + WORKER_TIMEOUT
-    while supervisor is not None and not service.link.dispatch.workers() and time.monotonic() < end:
-        supervisor.check()
-        service.link.check_name()
-        time.sleep(0.02)
+    """Waits for the first local worker, WORKER_TIMEOUT at most, and then until all is ready for the first factors,
+    READY_TIMEOUT at most."""
+    if supervisor is None:
+        return
+    for there, seconds in ((service.link.dispatch.workers, WORKER_TIMEOUT), (service.ready, READY_TIMEOUT)):
+        end = time.monotonic() + seconds
+        while not there():
+            if time.monotonic() > end:
+                return
+            supervisor.check()
+            service.link.check_name()
+            time.sleep(0.01)
 
 
 def main() -> None:

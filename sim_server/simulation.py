@@ -30,6 +30,7 @@ from sim_server.effects import effect
 from sim_server.effects._base import Effect, Refusal
 from sim_server.errors import DeviceError, InputError
 from sim_server.mechanics.energy import collected_energies
+from sim_server.mechanics.guess import make_guess
 from sim_server.mechanics.halving import check_memory, halving, time_steps
 from sim_server.mechanics.rosenbrock import RosenbrockIntegrator, make_integrator
 from sim_server.mechanics.shape_matching import ShapeMatching
@@ -99,6 +100,7 @@ class Simulation:
         elements = [e.elements for e in self.effects.values() if e.elements is not None and e.holds]
         self.system = System(self.world, [e.coupled for e in self.effects.values() if e.coupled is not None])
         matched = self._matched()
+        self.system.guess = make_guess(scene, self.world, self.system.dv)
         self.shape = ShapeMatching(self.world, matched, solver.warp_level) if matched else None
         self.warped = {body.index for body in self.rotated_bodies() + matched}  # whose solve is in the material frame
         self.system.warped[:] = [body.index in self.warped for body in self.world.bodies]
@@ -225,7 +227,8 @@ class Simulation:
         else:
             assemble += system.finish(matrix)  # into the material frame (eq. 12 and 13)
         settled = self.holders.last_launches(system) if self.holders and not self.integrator.has_stages else []
-        return assemble, [*settled, *self.integrator.advance()]
+        guess = [] if system.guess is None or euler else [system.guess.extrapolate()]
+        return assemble, [*settled, *self.integrator.advance(), *guess]
 
     def _forces_of(self, effect: Effect, stencil: Stencil | None) -> list[Launch]:
         """Returns the launches that add the forces of an effect: those without A, or all but the blocks of A."""

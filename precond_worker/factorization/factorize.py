@@ -2,13 +2,13 @@
 """Cholesky factors of one object: the symbolic phase once per topology, the numeric phase once per matrix."""
 
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
-from precond_worker.arrays import Float64, Int32, Together
+from precond_worker.arrays import Float64, Int32, Int64, Together
 from precond_worker.errors import NotPositiveDefinite
 from precond_worker.symbolic.blocks import BLOCK, checked_pattern
 from protocol.factor import FactorPattern
@@ -42,6 +42,18 @@ class ManyLibrary(Protocol):
     most: int
 
     def begin_many(self, matrices: Sequence[Float64], dtype: np.dtype[np.floating]) -> Together | None: ...
+
+
+@runtime_checkable
+class DeviceLibrary(Protocol):
+    """A library of a device, whose first matrix would wait for memory, and which factorizes what is there:
+    GpuFactorization."""
+
+    def make_ready(self, dtype: np.dtype[Any]) -> None: ...
+
+    def factorize_on_device(
+        self, matrix: int, dtype: np.dtype[np.floating], diagonal_blocks: Int64, threshold: float
+    ) -> Callable[[int], None] | None: ...
 
 
 class Analysis:
@@ -90,6 +102,24 @@ class Analysis:
             return self._library.factorize(matrix, kind, out)
         except NotPositiveDefinite as error:
             raise type(error)(self._where(error), error.column) from None
+
+    def factorize_on_device(
+        self, matrix: int, dtype: DTypeLike, diagonal_blocks: Int64, threshold: float
+    ) -> Callable[[int], None] | None:
+        """Factorizes a matrix at an address of device memory; returns what copies L to one. None: it must be factorized
+        on the host. diagonal_blocks, threshold: GpuFactorization.factorize_on_device"""
+        if not isinstance(self._library, DeviceLibrary):
+            return None
+        kind: np.dtype[Any] = np.dtype(dtype)
+        return self._library.factorize_on_device(matrix, kind, diagonal_blocks, threshold)
+
+    def make_ready(self, dtype: DTypeLike = np.float32) -> None:
+        """Does before the first matrix what it would wait for: on a GPU memory is taken and the launches are made.
+
+        dtype: of the factors that will be asked for. Raises MemoryError, DeviceUnusable.
+        """
+        if isinstance(self._library, DeviceLibrary):
+            self._library.make_ready(np.dtype(dtype))
 
     @property
     def most(self) -> int:

@@ -7,7 +7,7 @@
    growth of LDL^T is out of bounds.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 
 import numpy as np
@@ -60,6 +60,16 @@ class ModifiedCholesky:
             if found is None:
                 raise first
             return found
+
+    def factorize_on_device(self, matrix: int, dtype: DTypeLike) -> Callable[[int], None] | None:
+        """Factorizes a matrix at an address of device memory; returns what copies the L of `factorize` to one. None: it
+        may need a remedy, or the library is of the host."""
+        self.remedy = ""
+        return self._analysis.factorize_on_device(matrix, dtype, self._diagonal, pivot_threshold(dtype))
+
+    def make_ready(self) -> None:
+        """Does before the first matrix what it would wait for. Raises MemoryError, DeviceUnusable."""
+        self._analysis.make_ready()
 
     @property
     def most(self) -> int:

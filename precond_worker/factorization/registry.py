@@ -1,14 +1,24 @@
 # SPDX-License-Identifier: MIT
 """Factorizations by method (protocol.method)."""
 
-from typing import Any, Protocol
+from collections.abc import Callable
+from typing import Any, Protocol, runtime_checkable
 
 from numpy.typing import ArrayLike, NDArray
 
 from protocol.factor import FactorPattern
 from protocol.method import Method
 
-__all__ = ["Factorization", "make_factorization"]
+__all__ = ["DeviceFactorization", "Factorization", "make_factorization"]
+
+
+@runtime_checkable
+class DeviceFactorization(Protocol):
+    """A factorization that may leave matrix and factor on a device: ModifiedCholesky."""
+
+    remedy: str
+
+    def factorize_on_device(self, matrix: int, dtype: Any) -> Callable[[int], None] | None: ...
 
 
 class Factorization(Protocol):

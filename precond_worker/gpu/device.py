@@ -10,7 +10,7 @@ from protocol.process.nvidia import NoGpu, first_line, usable_cupy
 
 SOURCE = Path(__file__).with_name("multifrontal.cu")
 PRECISIONS = ("auto", "float32", "float64")
-KERNELS = ("reset", "check_finite", "assemble", "factor", "panel", "update", "store")
+KERNELS = ("reset", "check_finite", "assemble", "factor", "panel", "update", "store", "check_pivots")
 _C_TYPES = {"float32": "float", "float64": "double"}
 
 

@@ -151,6 +151,42 @@ class Executor:
         self._full = self._copies == 1  # until it is known that none failed
         return partial(self._end, values.reshape(len(matrices), -1), outcome)
 
+    def run_on_device(self, matrix: int) -> Outcome:
+        """Factorizes a matrix that is on the device, as `run`; L stays there (`pivots_are_sound`, `copy_values`).
+
+        matrix: address of the values, float64 (blocks, 3, 3), which nobody changes meanwhile
+        """
+        outcome = self._pinned(3, np.dtype(np.int32))
+        with self._usable():
+            self.stream.synchronize()
+            self._copy(self._blocks.data.ptr, matrix, self._blocks.nbytes)
+            self._graph.launch(self.stream)
+            self._copy(outcome.ctypes.data, self._status.data.ptr, outcome.nbytes)
+        return self._end(outcome, outcome)[1]
+
+    def pivots_are_sound(self, diagonal: Any, block: Any, threshold: float) -> bool:
+        """True if every pivot of the last factor is more than rounding error.
+
+        diagonal, block: on the device, as `check_pivots` in multifrontal.cu has them
+        threshold: of the square of a pivot over the largest diagonal entry of its node
+        """
+        with self._usable():
+            unsound = self._cp.zeros(1, np.int32)
+            self._cp.cuda.get_current_stream().synchronize()
+            with self.stream:
+                size = len(diagonal)
+                self._kernels["check_pivots"](
+                    (min(-(-size // 256), 264),), (256,),
+                    (self._values, diagonal, block, np.int32(size), self._blocks, np.float64(threshold), unsound),
+                )  # fmt: skip
+                return not unsound.get(stream=self.stream)[0]
+
+    def copy_values(self, to: int) -> None:
+        """Copies L of the matrix factorized last to an address; it is there when this returns."""
+        with self._usable():
+            self._copy(to, self._values.data.ptr, self._values.nbytes)
+            self.stream.synchronize()
+
     def _end(self, values: NDArray[Any], found: NDArray[np.int32]) -> tuple[NDArray[Any], Outcome]:
         with self._usable():
             self.stream.synchronize()

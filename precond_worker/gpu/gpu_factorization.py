@@ -1,24 +1,27 @@
 # SPDX-License-Identifier: MIT
 """Complete factorizations on the GPU."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from precond_worker.arrays import Float64, Int32, Together
+from precond_worker.arrays import Float64, Int32, Int64, Together
 from precond_worker.errors import NotPositiveDefinite, OutOfRange
 from precond_worker.gpu.assembly_tree import assembly_tree
 from precond_worker.gpu.copies import copies
-from precond_worker.gpu.device import best_precision, name, try_out
+from precond_worker.gpu.device import best_precision, cupy, name, try_out
 from precond_worker.gpu.executor import Executor
 from precond_worker.gpu.plan import MultifrontalPlan, make_plan
+from precond_worker.symbolic.blocks import BLOCK
 from precond_worker.symbolic.elimination import eliminate
 from precond_worker.symbolic.ordering import order_nodes
 from protocol.factor import FactorPattern
 
 MOST = 64  # matrices that are factorized together
 COPIES = (1, 4, 16, MOST)  # of a pattern in the plans that are made
+AT_A_TIME = 2  # factors of a matrix alone: one is being sent while the next one is made
 BYTES = 64 << 20  # of the matrices and factors of a launch, about
 
 
@@ -37,6 +40,7 @@ class GpuFactorization:
         self.pattern = FactorPattern.build(**tree.pattern_arrays())
         self.plan = make_plan(tree, row_start, columns)
         self._tree, self._row_start, self._columns = tree, row_start, columns
+        self._places: tuple[Any, Any] | None = None  # of what shows whether pivots are sound, on the device
         self._executors: dict[tuple[str, int], list[Executor]] = {}
         bytes_of_one = 8 * self.pattern.nonzeros + 72 * len(columns)
         self.most = max(1, min(MOST, BYTES // bytes_of_one))
@@ -57,6 +61,35 @@ class GpuFactorization:
             return values
         np.copyto(out, values)
         return out
+
+    def factorize_on_device(
+        self, matrix: int, dtype: np.dtype[np.floating], diagonal_blocks: Int64, threshold: float
+    ) -> Callable[[int], None] | None:
+        """Factorizes a matrix on the device; returns what copies L to an address there. None: it has no factor, or may
+        need a remedy.
+
+        matrix: address of the values (blocks, 3, 3)
+        diagonal_blocks: place of the diagonal block of each node
+        threshold: least square of a pivot, over the largest diagonal entry of its node
+        """
+        executor = self.executor(dtype.name)
+        outcome = executor.run_on_device(matrix)
+        if outcome.infinite or outcome.pivot >= 0 or outcome.range >= 0:
+            return None
+        if self._places is None:
+            cp, nodes = cupy(), self.pattern.permutation // BLOCK
+            blocks = diagonal_blocks[nodes].astype(np.int32)
+            self._places = cp.asarray(self.pattern.diagonal.astype(np.int64)), cp.asarray(blocks)
+            cp.cuda.get_current_stream().synchronize()
+        sound = executor.pivots_are_sound(*self._places, threshold)
+        return executor.copy_values if sound else None
+
+    def make_ready(self, dtype: np.dtype[Any]) -> None:
+        """Takes memory, makes the launches for matrices one by one, and tries them with zeros: the device then has all
+        that it loads at first use, and page-locked memory is there for as many L as are at a time."""
+        executor, zeros = self.executor(dtype.name), np.zeros((self.plan.blocks, 3, 3))
+        together = [executor.run([zeros]) for _ in range(AT_A_TIME)]
+        del together
 
     def begin_many(self, matrices: Sequence[Float64], dtype: np.dtype[np.floating]) -> Together | None:
         """Begins to factorize up to `most` matrices in the launches of one; None if the device has too little memory.

@@ -417,3 +417,14 @@ store(const Front* fronts, const int* start, int count, const real* __restrict__
     }
     if (!fine) atomicMin(&status->range, f.column + j);
 }
+
+// Whether a pivot of L is no more than rounding error of the largest diagonal entry of its node in A. diagonal: where values of L
+// are on its diagonal; block: of A on the diagonal, of the node of each column.
+extern "C" __global__ void check_pivots(const Value* values, const Long* diagonal, const int* block, int columns, const double* blocks,
+                                        double threshold, int* unsound) {
+    for (int i = blockIdx.x * blockDim.x + threadIdx.x; i < columns; i += gridDim.x * blockDim.x) {
+        const double pivot = (double)values[diagonal[i]], *a = blocks + 9 * (Long)block[i];
+        const double largest = fmax(fabs(a[0]), fmax(fabs(a[4]), fabs(a[8])));
+        if (!(pivot * pivot > threshold * largest)) *unsound = 1;
+    }
+}

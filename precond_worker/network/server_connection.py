@@ -24,7 +24,9 @@ from protocol.factor import FactorPattern
 from protocol.messages_pb2 import Factor, FactorBatch, Header, Scene, Topology, WorkerInfo
 from protocol.network.session import LINK_LEASE, Session
 from protocol.refused import Refused
+from protocol.shared_memory import device_probe
 from protocol.shared_memory import probe as shm_probe
+from protocol.shared_memory.device_probe import OpenedMemory
 from protocol.shared_memory.view import SlotMap
 from protocol.validate import check_header, parse
 
@@ -36,13 +38,14 @@ NAME_CONFLICT_TIME = 3.0  # s after the first hello in which a worker gives way 
 class ServerConnection:
     """One worker of one server. received: queue of samples with a matrix and of events of the server.
 
-    wake: set by each of them. Raises NameTaken if another worker has that name. Two that join at the same instant do
-    not see each other's token: one of them finds a NameTaken in `received`.
+    wake: set by each of them. device: opens device memory of servers; None: this worker has none. Raises NameTaken if
+    another worker has that name. Two that join at the same instant do not see each other's token: one of them finds a
+    NameTaken in `received`.
     """
 
     def __init__(
         self, session: Session, server: str, name: str, threads: int, library: str, counters: Counters,
-        wake: threading.Event | None = None,
+        wake: threading.Event | None = None, device: OpenedMemory | None = None,
     ):  # fmt: skip
         self.server, self.name = check_name(server, "server name"), check_name(name, "worker name")
         self.library = library
@@ -51,7 +54,9 @@ class ServerConnection:
         self.slots = SlotMap()
         self.incarnation = 0  # of the server that is served; 0: none
         self.shared_memory = False
+        self.device, self.device_memory = device, False
         self.share = 1.0  # part of this process's time for the server
+        self._together = 0
         self.leaving: float | None = None  # since when it takes no more jobs [s, monotonic]
         self._session, self._threads, self._can_assemble = session, threads, can_assemble()
         self._sequence: Counter[str] = Counter()
@@ -64,7 +69,7 @@ class ServerConnection:
         self._matrices = zs.declare_subscriber(key("matrix", server, worker=name), self.received.put)
         self._batches = zs.declare_subscriber(key("matrices", server, worker=name), self.received.put)
         self._token = zs.liveliness().declare_token(own)
-        self._retry = Retry()
+        self._retry, self._device_retry = Retry(), Retry()
         self._conflict_end = float("inf")  # [s, monotonic]; after that time it gives way to no other worker
         self._others = zs.declare_subscriber(key("worker", server, worker=name), self._heard)
         self._presence = Presence(zs, server, name, counters, self.received.put, lambda: self._heartbeat.wake())
@@ -100,9 +105,12 @@ class ServerConnection:
     def follow(self, incarnation: int) -> None:
         """Serves this incarnation of the server from now on; 0: none. Probes its shared memory and says hello."""
         self._retry.stop()
+        self._device_retry.stop()
         self.incarnation = self._presence.serving = 0
         self.slots.clear()
-        self.shared_memory = False
+        self.shared_memory = self.device_memory = False
+        if self.device is not None:
+            self.device.clear()
         if incarnation:
             obstacle = "switched off here"
             if self._session.shared_memory:
@@ -111,10 +119,31 @@ class ServerConnection:
             if obstacle and self._session.shared_memory:
                 self.counters.warn("no_shared_memory", f"arrays travel as bytes: {obstacle}")
                 self._retry.start(lambda: self._shared_memory_works(incarnation), self._enable_shared_memory)
+            if self.device is not None and self._session.shared_memory:
+                self.device_memory = self._device_works(incarnation)
+                if not self.device_memory:
+                    self._device_retry.start(lambda: self._device_works(incarnation), self._enable_device)
             self.incarnation = incarnation
             self._presence.serving = incarnation
             self._conflict_end = min(self._conflict_end, time.monotonic() + NAME_CONFLICT_TIME)
             self._heartbeat.wake()
+
+    def _device_works(self, incarnation: int) -> bool:
+        assert self.device is not None
+        why = device_probe.obstacle(self._session.zenoh, self.server, incarnation, self.name, self.device)
+        if why and why != device_probe.NOT_OFFERED:  # as by each server on a CPU
+            self.counters.warn("no_device_memory", f"matrices and factors travel through the host: {why}")
+        return not why
+
+    def _enable_device(self) -> None:
+        self.device_memory = True
+        self._heartbeat.wake()
+
+    def leave_device(self, why: str) -> None:
+        """Has matrices and factors travel through the host from now on."""
+        self.device_memory = False
+        self.counters.warn("no_device_memory", f"matrices and factors travel through the host from now on: {why}")
+        self._heartbeat.wake()
 
     def _beat(self) -> None:
         self._presence.look()
@@ -155,6 +184,8 @@ class ServerConnection:
                 leaving=self.leaving is not None,
                 most_jobs=MOST_JOBS,
                 batches=True,
+                together=self._together,
+                device_memory=self.device_memory,
             )
             self._session.zenoh.put(key("worker", self.server, worker=self.name), info.SerializeToString())
 
@@ -169,8 +200,13 @@ class ServerConnection:
             sequence=self._sequence[channel + object],
         )
 
-    def topology(self, object: str, epoch: int) -> Topology:
-        """Queries the topology of an object; raises Refused if the server does not have that of this epoch."""
+    def tell(self) -> None:
+        """Says hello at once, as what it tells has changed."""
+        self._heartbeat.wake()
+
+    def topology(self, object: str, epoch: int | None = None) -> Topology:
+        """Queries the topology of an object; raises Refused if the server does not have that of this epoch. None: the
+        present one"""
         for reply in self._session.zenoh.get(key("topology", self.server, object=object), timeout=TIMEOUT):
             if reply.ok is None:
                 break
@@ -205,6 +241,17 @@ class ServerConnection:
         name = key("factors", self.server, worker=self.name)
         self._session.zenoh.put(name, b"", attachment=message.SerializeToString(), congestion_control=BLOCK)
 
+    @property
+    def together(self) -> int:
+        """Number of matrices of one pattern that are factorized together."""
+        return self._together
+
+    @together.setter
+    def together(self, together: int) -> None:
+        if together != self._together:
+            self._together = together
+            self._heartbeat.wake()
+
     def leave(self) -> None:
         """Has the server send no more jobs; one under way may still be answered."""
         if self.leaving is None:
@@ -229,6 +276,7 @@ class ServerConnection:
     def close(self) -> None:
         """Ends the heartbeat; the session is closed by its owner."""
         self._retry.close()
+        self._device_retry.close()
         self._heartbeat.close()
 
     def __enter__(self) -> Self:

@@ -12,6 +12,8 @@ from pathlib import Path
 
 import numpy as np
 
+from protocol.process.cache_folder import remove_stale, unfinished
+
 
 def read_kept(path: Path, most: int) -> bytes | None:
     """Returns what is in a file and marks it as used; None if there is none of at most so many bytes that can be
@@ -44,7 +46,10 @@ def keep(path: Path, data: bytes, most: int) -> None:
 
 def _write(path: Path, data: bytes) -> None:
     path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-    with tempfile.NamedTemporaryFile(dir=path.parent, delete=False) as file:  # mode 0600
+    remove_stale(path.parent)
+    begin, end = f"{path.stem}.", unfinished(path).name.removeprefix(path.stem)
+    # with a name of its own, as threads may write the same file, and mode 0600
+    with tempfile.NamedTemporaryFile(prefix=begin, suffix=end, dir=path.parent, delete=False) as file:
         try:
             file.write(data)
             file.flush()

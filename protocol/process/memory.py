@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""How much memory this process may still take, by what the kernel says of the machine and of its control groups."""
+"""Memory of this process: how much it may still take, by what the kernel says of the machine and of its control groups,
+and what stays in it as long as it runs."""
 
+import gc
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -11,6 +13,13 @@ def available_memory() -> int | None:
     """Returns the bytes that can be had without swapping or being killed; None: not known, as on other systems."""
     known = [*_of_machine(), *_of_groups()]
     return max(0, min(known)) if known else None
+
+
+def keep_long_lived() -> None:
+    """Has the garbage collector never look again at the objects that are there now. A collection of all generations
+    would go through them, modules and what they hold, and keep Python's lock for some 50 ms meanwhile."""
+    gc.collect()
+    gc.freeze()
 
 
 def _of_machine() -> Iterator[int]:

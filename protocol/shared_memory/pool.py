@@ -29,7 +29,7 @@ MARK = 32  # bytes of the random mark by which a buffer is found in its segment
 OVERHEAD = 1 << 16  # bytes of a segment for zenoh's own data
 SMALLEST = 1 << 14  # bytes
 RESERVE = 32 << 20  # bytes of /dev/shm left to others
-LARGE = 4 << 20  # bytes of a slot that takes more than a few milliseconds to make, as its memory is cleared
+LARGE = 2 << 20  # bytes of a slot that takes more than a few milliseconds to make, as its memory is cleared
 
 
 class SlotsUnusable(Exception):
@@ -187,6 +187,11 @@ class SlotPool:
         """True if a slot for so many bytes is being made in a thread."""
         return any(_fits(size, capacity) for capacity in self._making.values())
 
+    @property
+    def makes_any(self) -> bool:
+        """True if a slot is being made in a thread."""
+        return not all(making.done() for making in self._making)
+
     def _take_made(self) -> None:
         """Adds the slots that the thread has made to those that are free."""
         for future in [each for each in self._making if each.done()]:
@@ -204,12 +209,12 @@ class SlotPool:
         """Returns the smallest capacity of a free slot that fits."""
         return min((c for c, slots in self._free.items() if slots and _fits(size, c)), default=None)
 
-    def give_back(self, slot: Slot) -> None:
-        """Takes a slot back from one of its users; a slot that is not lent is ignored."""
-        users = self._lent.pop(id(slot), 0)
-        if users > 1:
-            self._lent[id(slot)] = users - 1
-        elif users == 1:
+    def give_back(self, slot: Slot, users: int = 1) -> None:
+        """Takes a slot back from one of its users, or from several; a slot that is not lent is ignored."""
+        lent = self._lent.pop(id(slot), 0)
+        if lent > users:
+            self._lent[id(slot)] = lent - users
+        elif lent:
             self._put_back(slot)
 
     def _put_back(self, slot: Slot) -> None:

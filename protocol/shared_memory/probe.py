@@ -68,7 +68,8 @@ def obstacle(
     lane = secrets.randbelow(LANES)
     try:
         nonce = secrets.randbits(63)
-        reply, payload = _ask(session, server, incarnation, worker, lane, nonce, timeout)
+        question = Echo(header=Header(protocol=PROTOCOL, sequence=lane), nonce=nonce)
+        reply, payload = ask(session, server, incarnation, worker, question, timeout)
         if not reply.HasField("slot"):
             return "the server offers none"
         if payload.as_shm() is None:
@@ -78,16 +79,16 @@ def obstacle(
         if int(numbers[lane]) != nonce or int(sent[lane]) != nonce:
             return "the mapped segment does not show what the server wrote"
         numbers[LANES + lane] = nonce ^ 1
-        reply, _ = _ask(session, server, incarnation, worker, lane, nonce, timeout)
+        reply, _ = ask(session, server, incarnation, worker, question, timeout)
         return "" if reply.nonce == nonce ^ 1 else "the server does not see what is written there"
     except (Refused, zenoh.ZError, ValueError) as error:
         return str(error)
 
 
-def _ask(
-    session: zenoh.Session, server: str, incarnation: int, worker: str, lane: int, nonce: int, timeout: float
+def ask(
+    session: zenoh.Session, server: str, incarnation: int, worker: str, question: Echo, timeout: float
 ) -> tuple[Echo, zenoh.ZBytes]:
-    question = Echo(header=Header(protocol=PROTOCOL, sequence=lane), nonce=nonce)
+    """Worker: returns the answer of an incarnation of the server, and its payload; raises Refused without one."""
     selector = key("echo", server, worker=worker)
     replies = session.get(
         selector,

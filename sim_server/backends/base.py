@@ -18,7 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from protocol.factor import Factor, FactorPattern
-from sim_server.arrays import Float64, Int32
+from sim_server.arrays import Float64, Int32, Int64
+from sim_server.backends.shared_memory import SharedMemory
 from sim_server.backends.state import StateArray
 
 if TYPE_CHECKING:
@@ -132,6 +133,7 @@ class LoopState(Protocol):
     hold: number of a request to stand still between two steps, 0: none; held: the last one that it has followed
     frame_every, energy_every: steps between those that are reported, 0: none
     deadline: of the next step, 0: at once [s]
+    wake: descriptor (eventfd) to which it writes when a matrix that was asked for is there; 0: none
     record_capacity: records that find room
     late_steps, frames_dropped, records_dropped, others_dropped (reactions on what is no obstacle): numbers so far
     """
@@ -147,6 +149,7 @@ class LoopState(Protocol):
     hold: int
     held: int
     deadline: float
+    wake: int
     frame_every: int
     energy_every: int
     record_capacity: int
@@ -261,6 +264,10 @@ class Engine(Protocol):
         """
         ...
 
+    def may_prepare(self, body: int) -> bool:
+        """False while a factor of a body before has no step yet, so that another one would have to wait."""
+        ...
+
     def drop_factor(self, body: int, factor: Factor) -> None:
         """Gives up a factor that may have been prepared, and is not posted."""
         ...
@@ -270,8 +277,16 @@ class Engine(Protocol):
         From any thread."""
         ...
 
+    def shared_memory(self) -> SharedMemory | None:
+        """Returns device memory that other processes can open; None: there is none."""
+        ...
+
     def expect_factors(self, body: int, pattern: FactorPattern) -> None:
         """Prepares for factors of a pattern that will come, without waiting."""
+        ...
+
+    def expects_factors(self) -> bool:
+        """True once it is prepared for all factors that will come."""
         ...
 
     def resume_factor(self, body: int, pattern: FactorPattern, values: NDArray[Any], step: int) -> None:
@@ -310,6 +325,15 @@ class Engine(Protocol):
         """Has the values of the next matrix of the body copied into `target` (blocks, 3, 3)."""
         ...
 
+    def prepare_copies(self) -> None:
+        """Makes the memory of copies of matrices, for which the first request would wait."""
+        ...
+
+    def copy_memory(self, body: int) -> Float64 | None:
+        """Returns memory (blocks, 3, 3) that the loop brings the next matrix of a body to by itself: as target of
+        `request_matrix` it saves a copy. The matrix behind that one leaves it alone. None: there is none such."""
+        ...
+
     def request_positions(self, body: int, target: Float64, ahead: float = 0.0) -> None:
         """Has positions, `ahead` [s] further along their velocities, copied into `target` (nodes, 3).
 
@@ -320,6 +344,14 @@ class Engine(Protocol):
 
     def matrix_step(self, body: int) -> int:
         """Returns the number of steps completed before the copy requested last was made; -1: it is not there yet."""
+        ...
+
+    def matrix_steps(self, bodies: Sequence[int]) -> Int64:
+        """Returns `matrix_step` of each of some bodies."""
+        ...
+
+    def staged_matrix(self, body: int) -> int:
+        """Returns where the device has the matrix that was copied last; 0: nowhere, or with other numbers."""
         ...
 
     def replace(self, launch: int, new: Launch) -> PendingUpdate:

@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import IO
 
+from protocol.process.cache_folder import unfinished
 from sim_server.backends.cpu.processors import usable_processors
 
 LOOK = 5e-3  # s between looks at the compilers that run
@@ -39,8 +40,8 @@ class Job:
 
     @property
     def scratch(self) -> Path:
-        """Where the compiler writes: another process may make the same library."""
-        return self.library.with_suffix(f".{os.getpid()}.tmp")
+        """Where the compiler writes."""
+        return unfinished(self.library)
 
 
 @dataclass(frozen=True)

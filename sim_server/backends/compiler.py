@@ -19,7 +19,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from protocol.process.cache_folder import cache_folder
+from protocol.process.cache_folder import cache_folder, remove_stale
 from sim_server.backends.build_pool import CompileError, Job, compilers
 from sim_server.backends.cache_trust import distrust
 from sim_server.backends.processor_variants import LIBRARIES, made_by, variant
@@ -78,6 +78,7 @@ def _make(folder: Path) -> None:
         raise CompileError(
             f"compiled kernels cannot be kept in {folder}: {error.strerror}; WARPFACTOR_CACHE may name another folder"
         ) from error
+    remove_stale(folder)
 
 
 def read_text(path: str) -> tuple[str, str]:

@@ -52,7 +52,8 @@ def kernel_texts() -> list[str]:
 
 def host_texts() -> list[Path]:
     """Every C++ text of the server and of workers."""
-    return sorted(path for package in ("sim_server", "precond_worker") for path in (ROOT / package).rglob("*.cpp"))
+    packages = ("protocol", "sim_server", "precond_worker")
+    return sorted(path for package in packages for path in (ROOT / package).rglob("*.cpp"))
 
 
 def make_libraries(folder: Path, variants: list[str]) -> None:

@@ -3,6 +3,7 @@
 // points past obstacles.
 #pragma once
 #include "contact_law.cuh"
+#include "kinds.h"
 
 // Rows that are hit within FIRST of the step after the first one count as closed in the first pass; a pass is solved to a part between
 // EARLIEST and EARLY of its residual; a point that is held back stops at SHORT_OF of its way; a row that does not hold becomes HARDER times as stiff.
@@ -24,6 +25,12 @@ HOST_DEVICE double tolerance_of(double tolerance, bool rested, int passes, int m
 // there are no passes left, nothing would balance the forces of such rows. rounds: of passes after a sweep; passes: made; most: of any step.
 HOST_DEVICE bool gives_rows(int rounds, int passes, int most) {
     return rounds < ROUNDS && passes < most;
+}
+
+// Status of a step in contact whose solves came to `status`: it does not end where they did if the law does not hold there, or if nodes
+// were set back or held apart after them (`clipped`).
+HOST_DEVICE int status_in_contact(int status, bool holds, int clipped) {
+    return status == CONVERGED && (!holds || clipped > 0) ? CONTACT : status;
 }
 
 // Part of its residual to which a pass is solved that need not be the last one: the nearer to the solution the more exactly, since the next

@@ -5,7 +5,8 @@
 // Preconditioners. CHOLESKY: any factor; SSOR: not on a GPU.
 enum Kind { NONE = 0, JACOBI = 1, BLOCK_JACOBI = 2, CHOLESKY = 3, SSOR = 4 };
 
-// How a solve ended, the last three: a step; CONTACT: its passes ran out. SolveStatus in protocol/messages.proto has the same numbers.
+// How a solve ended, the last three: a step; CONTACT: not where its solves did, or without the law (status_in_contact).
+// SolveStatus in protocol/messages.proto has the same numbers.
 enum Status { CONVERGED = 0, MAX_ITERATIONS = 1, BUDGET = 2, BREAKDOWN_MATRIX = 3, BREAKDOWN_PRECONDITIONER = 4, NOT_FINITE = 5,
               MAX_LINEARIZATIONS = 6, RUNAWAY = 7, CONTACT = 8 };
 

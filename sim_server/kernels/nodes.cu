@@ -32,6 +32,7 @@ struct Rotate {
     own<real> diagonal;        // (n, 1) [kg]
     own<local> block;          // (n, 6) upper triangle, world frame [kg]
     const real* dv;            // (n, 3) solution of the last step, world frame [m/s]
+    const real* guess;         // (n, 3) of that of this step, or the same array [m/s]
     const real* x;             // (n, 3) [m]
     const real* v;             // (n, 3) velocity that the step begins with; zero without inertia [m/s]
     const real* extent;        // (n,) of the node's body [m]
@@ -41,7 +42,7 @@ struct Rotate {
     local* rotation;           // (n, 3, 3) out: frame of the node: its rotation from rest to now, or the identity
     real* b_material;          // (n, 3) out: R^T b, 0 at fixed nodes
     real* last_b;              // (n, 3) in, out: the same of the evaluation before, which no solve changes
-    real* y;                   // (n, 3) out: start of the solve: R^T dv; R^T (-v) where the node rests; 0 at fixed nodes
+    real* y;                   // (n, 3) out: start of the solve: R^T guess; R^T (-v) where the node rests; 0 at fixed nodes
     int* moving;               // (bodies,) out: set to 1 if a node of the body does not rest
     real* values;              // (blocks, 3, 3) out: R^T A R of the node's own block; the identity's at fixed nodes [kg]
 };
@@ -101,7 +102,7 @@ KERNEL(rotate, Rotate) {
     auto fixed = keep == 0;  // includes all nodes of a frozen body, whatever was assembled there
     vec3 zero = {}, b = select(fixed, zero, mul(Rt, load3(p.b, i))), v = load3(p.v, i);
     auto still = fixed | rests(p, i, b, v, (number)((k[0] + k[3] + k[5]) / 3));
-    vec3 y = select(fixed, zero, mul(Rt, select(still, -v, load3(p.dv, i))));
+    vec3 y = select(fixed, zero, mul(Rt, select(still, -v, load3(p.guess, i))));
     put_row(p.b_material, i, p.n, {b.x, b.y, b.z});
     put_row(p.last_b, i, p.n, {b.x, b.y, b.z});
     put_row(p.y, i, p.n, {y.x, y.y, y.z});

@@ -19,6 +19,7 @@ from sim_server.arrays import Float64, Int32, Int64
 from sim_server.backends.base import Launch
 from sim_server.mechanics import clusters
 from sim_server.mechanics.clusters import Couplings, PatchedCells, PatchedTetrahedra
+from sim_server.mechanics.guess import Guess
 from sim_server.mechanics.split_pattern import FollowedPattern, Numbering
 from sim_server.mechanics.world import World
 
@@ -62,6 +63,7 @@ class System:
         not in A; held_columns (blocks,): their free nodes
     extent (n,): diagonal of the box around the node's body at rest [m]
     rotation (n, 3, 3): frames of the nodes
+    guess: of dv, from which a solve starts; None: it starts from the last one; set before the launches are made
     warped (bodies,): 1 where frames follow the nodes' rotations, 0 where they stay the identity; set before the
         launches are made
     """
@@ -105,6 +107,7 @@ class System:
         self.b_material, self.last_b = np.zeros((n, 3)), np.zeros((n, 3))
         self.y = np.zeros((n, 3))
         self.dv = np.zeros((n, 3))
+        self.guess: Guess | None = None
         self.clock = np.zeros(1)
         world.backend.keep(self.clock, exact=True)
         world.backend.keep(*(a for o in (world, self) for a in vars(o).values() if isinstance(a, np.ndarray)))
@@ -145,9 +148,9 @@ class System:
         rotate = self.world.backend.module("kernels/nodes.cu").bind(
             "rotate", w.nodes, free=w.free, body=self.body, warped=self.warped, place=self.own,
             mean=self.mean, b=self.b, diagonal=self.diagonal, block=self.block, dv=self.dv,
-            x=w.x, v=velocity, extent=self.extent, inverse_time=self.inverse_time, h=w.dt, whole=int(matrix),
-            moving=self.moving, rotation=self.rotation, b_material=self.b_material, last_b=self.last_b, y=self.y,
-            values=self.values,
+            guess=self.guess.next if self.guess else self.dv, x=w.x, v=velocity, extent=self.extent,
+            inverse_time=self.inverse_time, h=w.dt, whole=int(matrix), moving=self.moving,
+            rotation=self.rotation, b_material=self.b_material, last_b=self.last_b, y=self.y, values=self.values,
         )  # fmt: skip
         kept = self.keep_directions(frames=True)
         if not matrix:

@@ -26,7 +26,7 @@ import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from protocol.process.cache_folder import cache_folder
+from protocol.process.cache_folder import cache_folder, remove_stale, unfinished
 from protocol.process.extras import to_install
 from sim_server.arrays import Float64, Int32, Int64
 from sim_server.errors import InputError
@@ -164,10 +164,12 @@ def _keep(path: Path, rest: Float64, tets: Int32) -> tuple[Float64, Int32]:
 
     Returns what is kept: where several processes fill a surface at a time, the mesh of the first one for all.
     """
-    part = path.with_suffix(f".{os.getpid()}.npz")
+    part = unfinished(path)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        np.savez_compressed(part, rest=rest, tets=tets)
+        remove_stale(path.parent)
+        with part.open("wb") as file:
+            np.savez_compressed(file, rest=rest, tets=tets)
         try:
             os.link(part, path)
         except OSError:  # it is there, or the file system knows no links

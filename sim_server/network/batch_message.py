@@ -8,17 +8,17 @@ from typing import NamedTuple
 import numpy as np
 
 from protocol.channels import PROTOCOL
+from protocol.factor import ROOM_ALIGNMENT
 from protocol.messages_pb2 import Header, MatrixBatch
 from protocol.method import Method
 from protocol.shared_memory.pool import Slot
-from protocol.validate import checksum
 from sim_server.arrays import Float64
 from sim_server.network.factor_decoder import AnnouncedObject
 from sim_server.network.leases import InFlightJob
+from sim_server.network.native_copies import native_copies
 from sim_server.updates.factor_source import Job
 
 MOST_TOGETHER = 64  # jobs of a message: as many as a worker on a GPU factorizes together
-ALIGNMENT = 64  # bytes to which the room of a factor is rounded up
 
 
 class Entry(NamedTuple):
@@ -35,7 +35,7 @@ def entries_of(jobs: Sequence[tuple[Job, AnnouncedObject]]) -> list[Entry]:
     made, first = [], 0
     for job, known in jobs:
         size = known.most_values(job.method.name) * np.dtype(job.dtype).itemsize
-        room = -(-size // ALIGNMENT) * ALIGNMENT
+        room = -(-size // ROOM_ALIGNMENT) * ROOM_ALIGNMENT
         made.append(Entry(job, known, room, first))
         first += room
     return made
@@ -65,13 +65,12 @@ def batch_message(
 
 
 def fill(message: MatrixBatch, matrices: Sequence[Float64], slot: Slot) -> None:
-    """Copies the matrices of a batch into their slot, and their checksums into its message. From any thread."""
-    values, begin = slot.array(np.float64, sum(matrix.size for matrix in matrices)), 0
-    for matrix in matrices:
-        part = values[begin : begin + matrix.size]
-        np.copyto(part.reshape(matrix.shape), matrix)
-        message.checksums.append(checksum(part))
-        begin += part.size
+    """Copies the matrices of a batch into their slot, and the checksums of the copies into its message. From any
+    thread."""
+    ends = np.cumsum([matrix.size for matrix in matrices])
+    parts = np.split(slot.array(np.float64, int(ends[-1])), ends[:-1])
+    sums, _ = native_copies().copy([np.ascontiguousarray(matrix) for matrix in matrices], parts)
+    message.checksums.extend(sums)
 
 
 def group(job: Job) -> tuple[str, Method]:

@@ -8,6 +8,7 @@ factor_intake.py; all of them share what is known of workers and jobs (bookkeepi
 import logging
 import threading
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import zenoh
 
@@ -16,14 +17,16 @@ from protocol.counters import Counters
 from protocol.factor import Factor, FactorPattern
 from protocol.messages_pb2 import Topology, WorkerInfo
 from protocol.refused import Refused
-from protocol.shared_memory.pool import SlotPool
+from protocol.shared_memory.pool import Slot, SlotPool
 from protocol.validate import take
 from sim_server.network.bookkeeping import Bookkeeping
+from sim_server.network.device_slots import DeviceSlot, DeviceSlots
 from sim_server.network.factor_decoder import FactorDecoder
-from sim_server.network.factor_intake import Decoding, FactorIntake
+from sim_server.network.factor_intake import FactorIntake
 from sim_server.network.inbox import Inbox
 from sim_server.network.job_sender import JobSender
 from sim_server.network.leases import InFlightJob, Leases
+from sim_server.network.native_copies import compile_ahead
 from sim_server.network.send_queue import SendQueue
 from sim_server.network.worker_choice import WorkerChoice
 from sim_server.network.worker_registry import WorkerRegistry
@@ -45,6 +48,8 @@ class Dispatch(FactorSource):
 
     silence: seconds without a heartbeat until a worker gets no more jobs
     clock: monotonic time [s]
+
+    device: device memory for matrices and factors; None: there is none
     """
 
     def __init__(
@@ -58,8 +63,10 @@ class Dispatch(FactorSource):
         silence: float,
         clock: Callable[[], float],
     ):
+        compile_ahead()
         self._counters, self._pool, self._shared, self._clock = counters, pool, pool is not None, clock
-        self.decoder, self.leases, self.reliability = FactorDecoder(incarnation), Leases(pool), WorkerReliability()
+        self.device: DeviceSlots | None = None
+        self.decoder, self.leases, self.reliability = FactorDecoder(incarnation), Leases(self), WorkerReliability()
         self._registry = WorkerRegistry(incarnation, silence)
         self._book = Bookkeeping(
             self._registry, self.leases, WorkerTiming(), self.reliability, self.decoder, clock
@@ -81,9 +88,18 @@ class Dispatch(FactorSource):
         }
 
     @property
-    def decoding(self) -> dict[int, Decoding]:
-        """Factors that are taken in beside the caller, by number of the job."""
-        return self._intake.decoding
+    def decoding(self) -> int:
+        """Number of factors that are taken in beside the caller. A probe for tests."""
+        return self._intake.decoded
+
+    def wake_by(self, wake: Callable[[], None]) -> None:
+        """Has `wake` called, in another thread, when a factor that is taken in beside the caller is there."""
+        self._intake.wake = wake
+
+    def makes_slots(self) -> bool:
+        """True while shared memory for arrays is being made beside the caller."""
+        with self._lock:
+            return any(slots is not None and slots.makes_any for slots in (self._pool, self.device))
 
     def announce(self, topology: Topology) -> None:
         """Begins a new epoch of an object; answers to jobs of the last one are refused."""
@@ -91,6 +107,20 @@ class Dispatch(FactorSource):
             self._book.announce(topology)
             if self._pool is not None:
                 self._pool.prepare(72 * len(topology.columns) // 4)  # of the matrix, 3x3 numbers of 8 bytes a block
+
+    def share_device(self, device: DeviceSlots) -> None:
+        """Has matrices and factors of workers that can open it stay in device memory."""
+        with self._lock:
+            self.device = self._sender.device = device
+            self.decoder.device = device.memory
+            for known in self.decoder.objects.values():
+                device.prepare(72 * known.blocks)
+
+    def give_back(self, slot: Slot | DeviceSlot, users: int = 1) -> None:
+        """Frees a slot of so many jobs that are over."""
+        pool: Any = self.device if isinstance(slot, DeviceSlot) else self._pool
+        if pool is not None:
+            pool.give_back(slot, users)
 
     def epoch(self, name: str) -> int | None:
         """Returns the epoch of an object that was announced last; jobs of others are refused."""
@@ -104,6 +134,11 @@ class Dispatch(FactorSource):
             self._receive()
             infos = (self._registry.info(name) for name in self._book.available())
             return [info for info in infos if info is not None]
+
+    def worker_info(self, name: str) -> WorkerInfo | None:
+        """Returns the last heartbeat of a worker; None if it has left."""
+        with self._lock:
+            return self._registry.info(name)
 
     def unclaimed_tokens(self) -> int:
         """Number of tokens of workers that have sent no heartbeat. A probe for tests."""
@@ -273,3 +308,4 @@ class Dispatch(FactorSource):
     def _on_pattern(self, sample: zenoh.Sample) -> None:
         if (new := self.decoder.add_pattern(sample.key_expr, sample.payload)) is not None:
             self._patterns = [*self._patterns, new][-MAX_NEW_PATTERNS:]
+            self._sender.prepare_for(new[1])

@@ -4,18 +4,22 @@
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 from weakref import WeakValueDictionary
 
 import numpy as np
+from numpy.typing import NDArray
 
 from protocol.channels import CHANNELS, MOST_JOBS, name_in
 from protocol.factor import Factor, FactorPattern, check_values
+from protocol.messages_pb2 import DeviceSlot as DeviceSlotMessage
 from protocol.messages_pb2 import Factor as FactorMessage
 from protocol.messages_pb2 import FactorBatch, Topology
 from protocol.messages_pb2 import FactorPattern as PatternMessage
 from protocol.messages_pb2 import Slot as SlotMessage
 from protocol.method import COMPLETE
 from protocol.refused import Refused
+from protocol.shared_memory.pool import Slot
 from protocol.validate import (
     Sized,
     array,
@@ -28,7 +32,9 @@ from protocol.validate import (
     topology_checksum,
 )
 from sim_server.arrays import Float32, Float64
+from sim_server.backends.shared_memory import SharedMemory
 from sim_server.network.leases import InFlightJob
+from sim_server.network.native_copies import native_copies
 from sim_server.updates.factor_source import FactorMemory
 
 LARGE = 1 << 20  # bytes of a factor for which `memory` is asked
@@ -79,19 +85,25 @@ class AnnouncedObject:
         return list(dict.fromkeys((*self.patterns, *self.complete.patterns)))
 
     def most_values(self, method: str) -> int:
-        """Number of values of the largest factor by a method so far, also of objects like it; 0: there was none."""
-        return max(self.largest.get(method, 0), self.complete.largest if method == COMPLETE else 0)
+        """Number of values of the largest factor by a method so far, also of objects like it; 0: not known. What is not
+        known of complete ones their pattern tells."""
+        if method != COMPLETE:
+            return self.largest.get(method, 0)
+        known = max(self.largest.get(method, 0), self.complete.largest)
+        return known or max((pattern.nonzeros for pattern in self.patterns.values()), default=0)
 
 
 class FactorDecoder:
     """Decodes messages of workers about objects that were announced. Its methods raise Refused.
 
     memory: makes the arrays that large factors are copied to (FactorSource.use_memory)
+    device: device memory in which factors may come
     """
 
     def __init__(self, incarnation: int):
         self._incarnation = incarnation
         self.memory: FactorMemory = np.empty
+        self.device: SharedMemory | None = None
         self.objects: dict[str, AnnouncedObject] = {}
         self._most_blocks = 0
         self._unsized: set[str] = set()  # objects that have had no factor in this epoch, nor has one like them
@@ -172,6 +184,9 @@ class FactorDecoder:
             raise Refused(f"Factor.pattern is {message.pattern:016x}, which was not sent before", "pattern")
         if message.nonzeros != pattern.nonzeros:
             raise Refused(f"Factor.nonzeros is {message.nonzeros}; allowed: {pattern.nonzeros}", "shape")
+        if message.HasField("device_slot"):
+            values = self._from_device(message.device_slot, pattern, job)
+            return self._made(known, pattern, values, job, message.seconds, message.remedy)
         if fetch is not None:
             return self._factor(known, pattern, fetch(), None, job, message.seconds, message.remedy)
         if message.HasField("slot"):
@@ -181,7 +196,7 @@ class FactorDecoder:
         return self._factor(known, pattern, values, message.checksum, job, message.seconds, message.remedy, seen)
 
     def parse_batch(self, key: object, attachment: Sized | None) -> FactorBatch:
-        """Parses a message with answers to several jobs. Each answer is checked by itself, in `decode_one`."""
+        """Parses a message with answers to several jobs. Each answer is checked by itself, in `decode_several`."""
         message = parse(FactorBatch, attachment, CHANNELS["factors"].limit)
         check_header(message, incarnation=self._incarnation)
         check_strings(message, 256)
@@ -196,38 +211,76 @@ class FactorDecoder:
             raise Refused(f"FactorBatch.jobs has {count} numbers, texts {texts}; allowed: none or as many", "shape")
         return message
 
-    def decode_one(self, message: FactorBatch, place: int, job: InFlightJob) -> Factor:
-        """Returns one of the factors of a message, which answers a job."""
-        seconds, nonzeros = message.seconds[place], message.nonzeros[place]
-        if not 0 <= seconds < math.inf:
-            raise Refused(f"FactorBatch.seconds has {seconds}; allowed: finite, 0 or more", "malformed")
-        known = self._known(job)
-        pattern = known.pattern(message.patterns[place])
-        if pattern is None:
-            raise Refused(f"FactorBatch.patterns has {message.patterns[place]:016x}, which was not sent", "pattern")
-        if nonzeros != pattern.nonzeros:
-            raise Refused(f"FactorBatch.nonzeros has {nonzeros}; allowed: {pattern.nonzeros}", "shape")
-        values, seen = self._from_slot(message.slot, nonzeros, job)
-        remedy = message.remedies[place] if message.remedies else ""
-        return self._factor(known, pattern, values, message.checksums[place], job, seconds, remedy, seen)
-
     def decode_several(
         self, message: FactorBatch, answers: Sequence[tuple[int, InFlightJob]]
     ) -> list[Factor | Refused]:  # fmt: skip
-        """Returns the factors at some places of a message, or why one is refused. From any thread."""
-        made: list[Factor | Refused] = []
-        for place, job in answers:
+        """Returns the factors at some places of a message, or why one is refused. From any thread.
+
+        They are copied by one call of native code, one after another into one array.
+        """
+        made: list[Factor | Refused] = [Refused("there is no factor", "malformed")] * len(answers)
+        columns = _AnswerColumns.of(message)
+        found: list[tuple[int, int, InFlightJob, AnnouncedObject, FactorPattern]] = []
+        for k, (place, job) in enumerate(answers):
             try:
-                made.append(self.decode_one(message, place, job))
+                found.append((k, place, job, *self._expected(columns, place, job)))
             except Refused as refusal:
-                made.append(refusal)
+                made[k] = refusal
+        if not found:
+            return made
+        values = self._copied([(job, pattern.nonzeros) for _, _, job, _, pattern in found])
+        positive = _positive(values, [pattern for *_, pattern in found])
+        for (k, place, job, known, pattern), (each, checked, finite), good in zip(found, values, positive, strict=True):
+            told = columns.checksums[place], job, columns.seconds[place], columns.remedies[place]
+            try:
+                made[k] = self._factor(known, pattern, each, *told, (checked, finite), good)
+            except Refused as refusal:
+                made[k] = refusal
         return made
+
+    def _expected(
+        self, columns: "_AnswerColumns", place: int, job: InFlightJob
+    ) -> tuple[AnnouncedObject, FactorPattern]:  # fmt: skip
+        """Returns the object and the pattern of one of the answers, which has room in its slot."""
+        seconds, nonzeros, id = columns.seconds[place], columns.nonzeros[place], columns.patterns[place]
+        if not 0 <= seconds < math.inf:
+            raise Refused(f"FactorBatch.seconds has {seconds}; allowed: finite, 0 or more", "malformed")
+        known = self._known(job)
+        pattern = known.pattern(id)
+        if pattern is None:
+            raise Refused(f"FactorBatch.patterns has {id:016x}, which was not sent", "pattern")
+        if nonzeros != pattern.nonzeros:
+            raise Refused(f"FactorBatch.nonzeros has {nonzeros}; allowed: {pattern.nonzeros}", "shape")
+        _check_slot(columns.slot, nonzeros, job)
+        return known, pattern
+
+    def _copied(self, found: Sequence[tuple[InFlightJob, int]]) -> list[tuple[Float32 | Float64, int, bool]]:
+        """Copies numbers of values out of the slots allocated for jobs, which are of one type: they must not change any
+        more once they are checked. Returns them, their checksum, and whether all are finite, of each."""
+        dtype = np.dtype(found[0][0].dtype)
+        ends = np.cumsum([count for _, count in found])
+        total = int(ends[-1])
+        if total * dtype.itemsize > LARGE:
+            memory = self.memory(1 << (total - 1).bit_length(), dtype)  # of few sizes, so that it is used again
+        else:
+            memory = np.empty(total, dtype)
+        values = np.split(memory[:total], ends[:-1])
+        sources = [_slot(job).part(job.first, dtype, count) for job, count in found]
+        return list(zip(values, *native_copies().copy(sources, values), strict=True))
 
     def _factor(
         self, known: AnnouncedObject, pattern: FactorPattern, values: Float32 | Float64, checksum: int | None,
         job: InFlightJob, seconds: float, remedy: str, seen: tuple[int, bool] | None = None,
+        positive: bool | None = None,
     ) -> Factor:  # fmt: skip
-        check_values(values, pattern, checksum, seen)
+        check_values(values, pattern, checksum, seen, positive)
+        return self._made(known, pattern, values, job, seconds, remedy)
+
+    def _made(
+        self, known: AnnouncedObject, pattern: FactorPattern, values: Float32 | Float64, job: InFlightJob,
+        seconds: float, remedy: str,
+    ) -> Factor:  # fmt: skip
+        """Returns the factor of values that were checked."""
         known.largest[job.method] = max(known.largest.get(job.method, 0), pattern.nonzeros)
         self._unsized.discard(job.object)
         if job.method == COMPLETE and pattern.id not in known.complete.patterns:
@@ -254,24 +307,83 @@ class FactorDecoder:
     ) -> tuple[Float32 | Float64, tuple[int, bool]]:  # fmt: skip
         """Copies the values out of the slot allocated for the job: they must not change any more once they are checked.
         Returns them, their checksum, and whether all are finite."""
-        slot = job.factor_slot
-        if slot is None:
-            raise Refused("Factor.slot is set, but no slot was lent for this job", "slot")
-        given = (told.segment, told.offset, told.generation)
-        allocated = (slot.segment, slot.offset, job.factor_generation)
-        if given != allocated:
-            raise Refused(f"Factor.slot is {given}; allowed: {allocated}, as lent for this job", "slot")
-        size, room = nonzeros * np.dtype(job.dtype).itemsize, job.room or slot.capacity
-        if size > room:
-            raise Refused(f"Factor.nonzeros is {nonzeros}: {size} bytes in a slot of {room}", "slot")
+        size = _check_slot((told.segment, told.offset, told.generation), nonzeros, job)
         values = (self.memory if size > LARGE else np.empty)(nonzeros, np.dtype(job.dtype))
-        return values, copied(slot.part(job.first, job.dtype, nonzeros), values, own=values)
+        return values, copied(_slot(job).part(job.first, job.dtype, nonzeros), values, own=values)
+
+    def _from_device(self, told: DeviceSlotMessage, pattern: FactorPattern, job: InFlightJob) -> Float32 | Float64:
+        """Returns a copy of the values in the slot of device memory that was lent for the job, which are checked."""
+        slot = job.device_slot
+        if slot is None or self.device is None:
+            raise Refused("Factor.device_slot is set, but no slot was lent for this job", "slot")
+        if (told.handle, told.generation) != (slot.handle, job.device_generation):
+            raise Refused(
+                f"Factor.device_slot is {told.handle[:8].hex()} ({len(told.handle)} bytes), generation "
+                f"{told.generation}; allowed: {slot.handle[:8].hex()}, {job.device_generation}, as lent for this job",
+                "slot",
+            )
+        dtype = np.dtype(job.dtype)
+        if (size := pattern.nonzeros * dtype.itemsize) > slot.capacity:
+            raise Refused(f"Factor.nonzeros is {pattern.nonzeros}: {size} bytes in a slot of {slot.capacity}", "slot")
+        return self.device.take(slot.address, pattern, dtype)
 
     def _object(self, message: PatternMessage | FactorMessage, key: object, channel: str) -> AnnouncedObject:
         header = check_header(message, incarnation=self._incarnation, object=self.objects)
         if header.object != name_in(channel, key, "object"):
             raise Refused(f"{message.DESCRIPTOR.name}.header.object is {header.object!r}, its key is {key}", "object")
         return self.objects[header.object]
+
+
+@dataclass(frozen=True)
+class _AnswerColumns:
+    """What a message tells of each of its factors. slot: segment, offset and generation of theirs"""
+
+    seconds: list[float]
+    nonzeros: list[int]
+    patterns: list[int]
+    checksums: list[int]
+    remedies: list[str]
+    slot: tuple[str, int, int]
+
+    @classmethod
+    def of(cls, message: FactorBatch) -> "_AnswerColumns":
+        slot, remedies = message.slot, list(message.remedies) or [""] * len(message.jobs)
+        return cls(
+            list(message.seconds), list(message.nonzeros), list(message.patterns), list(message.checksums), remedies,
+            (slot.segment, slot.offset, slot.generation),
+        )  # fmt: skip
+
+
+def _slot(job: InFlightJob) -> Slot:
+    assert job.factor_slot is not None
+    return job.factor_slot
+
+
+def _check_slot(given: tuple[str, int, int], nonzeros: int, job: InFlightJob) -> int:
+    """Returns the bytes of a factor that fits into the slot allocated for its job, and is said to be there."""
+    slot = job.factor_slot
+    if slot is None:
+        raise Refused("Factor.slot is set, but no slot was lent for this job", "slot")
+    allocated = (slot.segment, slot.offset, job.factor_generation)
+    if given != allocated:
+        raise Refused(f"Factor.slot is {given}; allowed: {allocated}, as lent for this job", "slot")
+    size, room = nonzeros * np.dtype(job.dtype).itemsize, job.room or slot.capacity
+    if size > room:
+        raise Refused(f"Factor.nonzeros is {nonzeros}: {size} bytes in a slot of {room}", "slot")
+    return size
+
+
+def _positive(
+    values: Sequence[tuple[Float32 | Float64, int, bool]], patterns: Sequence[FactorPattern]
+) -> list[bool]:  # fmt: skip
+    """Returns whether the diagonal of each L is positive; values: one after another in one array."""
+    first, count = values[0][0], patterns[0].nonzeros
+    if any(pattern is not patterns[0] for pattern in patterns):
+        return [bool((each[0][p.diagonal] > 0).all()) for each, p in zip(values, patterns, strict=True)]
+    strides = first.nbytes, first.itemsize
+    every: NDArray[Any] = np.lib.stride_tricks.as_strided(first, (len(values), count), strides)
+    good: list[bool] = np.all(every[:, patterns[0].diagonal] > 0, axis=1).tolist()
+    return good
 
 
 def _from_payload(message: FactorMessage, payload: Sized) -> Float32 | Float64:

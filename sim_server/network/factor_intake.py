@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: MIT
 """Takes in what workers answer: factors alone, in batches and in parts, large ones beside the caller."""
 
+from collections import deque
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import zenoh
 
@@ -18,15 +19,19 @@ from sim_server.network.bookkeeping import Bookkeeping
 from sim_server.network.factor_fetch import AHEAD, FactorFetch
 from sim_server.network.leases import InFlightJob
 
+T = TypeVar("T")
+
 LARGE = 4 << 20  # bytes of a factor whose copy and checks take more than a few milliseconds
 FETCHES = 2  # factors that arrive in parts at a time, each in memory of its own
+Results = list[Factor | Refused]
+"""Of decoding the factors of a message: each, or why it is refused."""
 
 
 class Decoding(NamedTuple):
     """A factor that is taken in beside the caller.
 
     future: that is over once it is done, and `take` returns the factor, or raises Refused
-    seconds, by_slot, duration: as of FactorIntake._take_factor
+    seconds, by_slot: as of FactorIntake._take_factor
     fetch: of its parts, if it comes in parts
     """
 
@@ -35,8 +40,21 @@ class Decoding(NamedTuple):
     take: Callable[[], Factor]
     seconds: float
     by_slot: tuple[bool, bool]
-    duration: float | None = None
     fetch: FactorFetch | None = None
+
+
+class DecodedTogether(NamedTuple):
+    """Factors of one message.
+
+    seconds: time of each factorization [s], by the worker
+    matrix_shared: matrices travelled in shared memory
+    duration: from matrix to factor of each [s]
+    """
+
+    jobs: Sequence[InFlightJob]
+    seconds: Sequence[float]
+    matrix_shared: bool
+    duration: float
 
 
 class FactorIntake:
@@ -44,7 +62,6 @@ class FactorIntake:
 
     pool: shared memory for parts; None: they travel as bytes
     factors: that passed all checks, until they are told
-    decoding: what is taken in beside the caller, by number of the job
     """
 
     def __init__(
@@ -56,21 +73,30 @@ class FactorIntake:
         self._thread = ThreadPoolExecutor(1, "large factors")
         self._fetching = ThreadPoolExecutor(FETCHES, "parts of factors")
         self.factors: list[Factor] = []
-        self.decoding: dict[int, Decoding] = {}
+        self._decoding: dict[int, Decoding] = {}  # beside the caller, by number of the job
+        self._together: deque[tuple[DecodedTogether, Future[Results]]] = deque()  # likewise, oldest first
+        self._beside: set[int] = set()  # numbers of their jobs
         self._fetches: set[int] = set()  # of these, the jobs whose factors come in parts
+        self.wake: Callable[[], None] = lambda: None  # called in another thread when a factor is decoded
 
     def fetched_from(self, worker: str) -> int:
         """Number of factors that are fetched from a worker part by part."""
-        return sum(self.decoding[number].job.worker == worker for number in self._fetches)
+        return sum(self._decoding[number].job.worker == worker for number in self._fetches)
 
     def is_decoded(self, job: InFlightJob) -> bool:
         """True while the answer to a job is taken in beside the caller."""
-        return job.number in self.decoding
+        return job.number in self._decoding or job.number in self._beside
+
+    @property
+    def decoded(self) -> int:
+        """Number of answers that are taken in beside the caller."""
+        return len(self._decoding) + len(self._beside)
 
     def is_arriving(self, job: InFlightJob) -> bool:
         """True while the answer to a job is taken in, unless it comes in parts and none comes any more."""
-        each = self.decoding.get(job.number)
-        return each is not None and not (each.fetch is not None and each.fetch.stalls)
+        each = self._decoding.get(job.number)
+        stalls = each is not None and each.fetch is not None and each.fetch.stalls
+        return self.is_decoded(job) and not stalls
 
     # ---- messages --------------------------------------------------------------------------------------------
 
@@ -85,10 +111,11 @@ class FactorIntake:
         if message.parts and not message.failure:
             return self._fetch(message, job)
         decode = partial(self._book.decoder.decode, message, sample.payload, job)
-        if not message.failure and 4 * message.nonzeros > LARGE:  # its bytes are copied and checked beside the caller
+        on_device = message.HasField("device_slot")
+        if not message.failure and (on_device or 4 * message.nonzeros > LARGE):  # copied and checked beside the caller
             self._refuse_second(job)
-            future = self._thread.submit(decode)
-            self.decoding[job.number] = Decoding(job, future, future.result, message.seconds, _slots_used(message))
+            future = self._woken(self._thread.submit(decode))
+            self._decoding[job.number] = Decoding(job, future, future.result, message.seconds, _slots_used(message))
             return
         self._take_factor(job, decode, message.failure, message.seconds, _slots_used(message))
 
@@ -96,40 +123,44 @@ class FactorIntake:
         """Takes answers to jobs of a batch, each by itself: what is wrong with one costs the others nothing."""
         message = self._book.decoder.parse_batch(sample.key_expr, sample.attachment)
         self._book.registry.mark_seen(message.worker, self._book.clock())
-        duration, large = 0.0, 4 * sum(message.nonzeros) > LARGE
-        beside: dict[int, tuple[int, InFlightJob]] = {}  # by number; large all together: decoded beside the caller
+        answers = self._matched(message)
+        if not answers:
+            return
+        duration = self._duration(next(iter(answers.values()))[1]) / len(message.jobs)
+        self._note_answer(message.worker)
+        good = []
+        for place, job in answers.values():
+            if self._book.leases.is_reassigned(job):
+                self._book.leases.finish(job)
+            elif failure := _failure(message, place):
+                self._take_factor(job, _no_factor, failure, 0.0, (True, True))
+            else:
+                good.append((place, job))
+        seconds = [message.seconds[place] for place, _ in good]
+        together = DecodedTogether([job for _, job in good], seconds, message.matrix_shared, duration)
+        decode = partial(self._book.decoder.decode_several, message, good)
+        if 4 * sum(message.nonzeros) <= LARGE:
+            return self._take_together(together, decode())
+        self._together.append((together, self._woken(self._thread.submit(decode))))
+        self._beside.update(job.number for job in together.jobs)
+
+    def _matched(self, message: FactorBatch) -> dict[int, tuple[int, InFlightJob]]:
+        """Returns place and job of the answers that are of a job in flight and the first to it, by its number."""
+        found: dict[int, tuple[int, InFlightJob]] = {}
         for place, number in enumerate(message.jobs):
             try:
                 job = self._book.leases.match_answer(number, message.worker, None)
-                if not duration:
-                    duration = self._duration(job) / len(message.jobs)
-                    self._note_answer(message.worker)
-                if self._takes_beside(message, place, job, large):
-                    if number in self.decoding or number in beside:
-                        raise Refused(f"FactorBatch.jobs has {number}, already answered", "duplicate")
-                    beside[number] = place, job
-                else:
-                    self._take_one(message, place, job, duration)
+                if number in found or self.is_decoded(job):
+                    raise Refused(f"FactorBatch.jobs has {number}, already answered", "duplicate")
+                found[number] = place, job
             except Refused as refusal:
                 self._counters.refuse(refusal)
-        if beside:
-            future = self._thread.submit(self._book.decoder.decode_several, message, list(beside.values()))
-            for k, (place, job) in enumerate(beside.values()):
-                take, by_slot = partial(_result, future, k), (message.matrix_shared, True)
-                self.decoding[job.number] = Decoding(job, future, take, message.seconds[place], by_slot, duration)
+        return found
 
-    def _takes_beside(self, message: FactorBatch, place: int, job: InFlightJob, large: bool) -> bool:
-        return large and not _failure(message, place) and not self._book.leases.is_reassigned(job)
-
-    def _take_one(self, message: FactorBatch, place: int, job: InFlightJob, duration: float) -> None:
-        """Takes an answer of a batch at once."""
-        if self._book.leases.is_reassigned(job):
-            self._book.leases.finish(job)
-        elif failure := _failure(message, place):
-            self._take_factor(job, _no_factor, failure, 0.0, (True, True))
-        else:
-            decode, by_slot = partial(self._book.decoder.decode_one, message, place, job), (message.matrix_shared, True)
-            self._take_factor(job, decode, "", message.seconds[place], by_slot, duration)
+    def _woken(self, future: Future[T]) -> Future[T]:
+        """Has who takes in factors woken at the end of a decoding."""
+        future.add_done_callback(lambda _: self.wake())
+        return future
 
     def _note_answer(self, worker: str) -> None:
         self._book.free_since[worker] = self._book.clock()
@@ -149,8 +180,8 @@ class FactorIntake:
             self._slots_for_parts(job),
         )  # fmt: skip
         decode = partial(self._book.decoder.decode, message, b"", job, fetch.run)
-        future, by_slot = self._fetching.submit(decode), _slots_used(message, fetch)
-        self.decoding[job.number] = Decoding(job, future, future.result, message.seconds, by_slot, fetch=fetch)
+        future, by_slot = self._woken(self._fetching.submit(decode)), _slots_used(message, fetch)
+        self._decoding[job.number] = Decoding(job, future, future.result, message.seconds, by_slot, fetch=fetch)
         self._fetches.add(job.number)
 
     def _slots_for_parts(self, job: InFlightJob) -> list[Slot]:
@@ -183,12 +214,15 @@ class FactorIntake:
     def take_decoded(self) -> None:
         """Takes the large factors that were decoded beside the caller, unless their jobs are over."""
         for number in self._fetches:
-            job, fetch = self.decoding[number].job, self.decoding[number].fetch
+            job, fetch = self._decoding[number].job, self._decoding[number].fetch
             if fetch is not None and self._book.leases.by_object.get(job.object) is not job:
                 fetch.give_up()
-        done = {id(future) for future in {each.future for each in self.decoding.values()} if future.done()}
-        for number in [number for number, each in self.decoding.items() if id(each.future) in done]:
-            each = self.decoding.pop(number)
+        while self._together and self._together[0][1].done():
+            together, future = self._together.popleft()
+            self._beside.difference_update(job.number for job in together.jobs)
+            self._take_together(together, future.result())
+        for number in [number for number, each in self._decoding.items() if each.future.done()]:
+            each = self._decoding.pop(number)
             self._fetches.discard(number)
             try:
                 self._end_decoding(each)
@@ -205,17 +239,38 @@ class FactorIntake:
         current = self._book.leases.match_answer(job.number, job.worker, job.epoch)
         if self._book.leases.is_reassigned(current):
             return self._book.leases.finish(current)
-        self._take_factor(current, each.take, "", each.seconds, by_slot, each.duration)
+        self._take_factor(current, each.take, "", each.seconds, by_slot)
+
+    def _take_together(self, together: DecodedTogether, results: Sequence[Factor | Refused]) -> None:
+        """Takes the factors of a message that passed all checks, unless their jobs are over, and notes why others did
+        not."""
+        leases, taken, seconds = self._book.leases, [], []
+        for job, told, result in zip(together.jobs, together.seconds, results, strict=True):
+            try:
+                current = leases.match_answer(job.number, job.worker, job.epoch)
+                if leases.is_reassigned(current):
+                    leases.finish(current)
+                elif isinstance(result, Refused):
+                    self._take_factor(current, partial(_refuse, result), "", 0.0, (together.matrix_shared, True))
+                else:
+                    taken.append(current)
+                    seconds.append(told)
+                    self.factors.append(result)
+            except Refused as refusal:
+                self._counters.refuse(refusal)
+        if taken:
+            self._book.timing.record_all(taken[0].worker, [job.object for job in taken], together.duration, seconds)
+            leases.finish_all(taken, seconds)
+            size = sum(factor.values.nbytes for factor in self.factors[-len(taken) :])
+            self._count(taken[0], size, (together.matrix_shared, True), len(taken))
 
     def _take_factor(
-        self, job: InFlightJob, decode: Callable[[], Factor], failure: str, told: float, by_slot: tuple[bool, bool],
-        duration: float | None = None,
+        self, job: InFlightJob, decode: Callable[[], Factor], failure: str, told: float, by_slot: tuple[bool, bool]
     ) -> None:  # fmt: skip
         """Takes the answer to a job: the factor that `decode` returns, or a failure.
 
         told: time [s] of the factorization, by the worker
         by_slot: matrix and factor travelled in shared memory
-        duration: from matrix to factor [s]; None: until now
         """
         book, seconds = self._book, None
         try:
@@ -225,8 +280,7 @@ class FactorIntake:
                 return book.fail(job, f"failed: {failure[:500]}")
             self.factors.append(decode())
             seconds = told
-            lasted = self._duration(job) if duration is None else duration
-            book.timing.record(job.worker, job.object, lasted, seconds)
+            book.timing.record(job.worker, job.object, self._duration(job), seconds)
         except Refused as refusal:
             book.reliability.on_failure(job.worker, job.object, book.clock())
             book.fail(job, f"was refused: {refusal}")
@@ -241,15 +295,17 @@ class FactorIntake:
         last, self._book.answered_at[job.worker] = self._book.answered_at.get(job.worker, 0.0), now
         return now - max(job.sent_at, last)
 
-    def _count(self, job: InFlightJob, size: int, by_slot: tuple[bool, bool]) -> None:
-        """Counts a factor of `size` bytes, and how it and its matrix travelled."""
-        self._counters.add("factors")
+    def _count(self, job: InFlightJob, size: int, by_slot: tuple[bool, bool], factors: int = 1) -> None:
+        """Counts factors of `size` bytes together, and how they and their matrices travelled. job: one of theirs"""
+        self._counters.add("factors", factors)
         self._counters.add("bytes_in", size)
         capacity = job.factor_slot.capacity if job.factor_slot is not None else 0
         fits = 0 < size <= capacity  # an incomplete factor may be the largest so far
         for what, shared, allocated in (("matrix", by_slot[0], bool(job.slots)), ("factor", by_slot[1], fits)):
-            self._counters.add("bulk_shared" if shared else "bulk_copied")
+            self._counters.add("bulk_shared" if shared else "bulk_copied", factors)
+            self._counters.add("bulk_on_device", factors if shared and job.device_slot is not None else 0)
             if allocated and not shared:
+                self._counters.add("slots_unused", factors - 1)
                 self._counters.trouble(
                     "slots_unused", f"a slot was lent to worker {job.worker}, but its {what} travelled as bytes"
                 )
@@ -265,14 +321,12 @@ def _no_factor() -> Factor:
     raise Refused("there is no factor", "malformed")
 
 
-def _result(future: Future[list[Factor | Refused]], place: int) -> Factor:
-    """Returns one of several factors that were decoded together; raises Refused."""
-    found = future.result()[place]
-    if isinstance(found, Refused):
-        raise found
-    return found
+def _refuse(refusal: Refused) -> Factor:
+    """Raises Refused: the factor did not pass a check."""
+    raise refusal
 
 
 def _slots_used(message: FactorMessage, fetch: FactorFetch | None = None) -> tuple[bool, bool]:
     """Whether matrix and factor travelled in shared memory. fetch: of its parts"""
-    return message.matrix_shared, message.HasField("slot") or (fetch is not None and bool(fetch.slots))
+    in_slot = message.HasField("slot") or message.HasField("device_slot")
+    return message.matrix_shared, in_slot or (fetch is not None and bool(fetch.slots))

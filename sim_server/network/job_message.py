@@ -15,7 +15,8 @@ from sim_server.network.leases import InFlightJob
 
 
 def matrix_message(job: InFlightJob, known: AnnouncedObject, incarnation: int, lease: float, method: Method) -> Matrix:
-    """Returns the message of a job without checksum, matrix slot and nodes, which `add_values` fills in.
+    """Returns the message of a job without checksum, matrix slot and nodes, which `add_values` fills in unless the
+    matrix is on a device.
 
     lease: time [s] that the worker has for its answer
     """
@@ -43,6 +44,8 @@ def matrix_message(job: InFlightJob, known: AnnouncedObject, incarnation: int, l
     )
     if job.factor_slot is not None:
         message.factor_slot.CopyFrom(job.factor_slot.message())
+    if job.device_slot is not None:
+        message.device_factor.CopyFrom(job.device_slot.message())
     return message
 
 

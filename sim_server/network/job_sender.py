@@ -12,13 +12,16 @@ import zenoh
 
 from protocol.channels import PART_BYTES, WHOLE_PARTS, key
 from protocol.counters import Counters
-from protocol.messages_pb2 import MatrixBatch
-from protocol.method import Method
+from protocol.factor import FactorPattern
+from protocol.messages_pb2 import Matrix, MatrixBatch
+from protocol.method import COMPLETE, Method
 from protocol.shared_memory.limits import SLOT_SHARE
 from protocol.shared_memory.pool import Slot, SlotPool
 from sim_server.arrays import Float64
+from sim_server.backends.shared_memory import PlacedMatrix
 from sim_server.network.batch_message import MOST_TOGETHER, Entry, batch_message, entries_of, fill, group
 from sim_server.network.bookkeeping import Bookkeeping
+from sim_server.network.device_slots import DeviceSlot, DeviceSlots
 from sim_server.network.job_message import add_values, matrix_message
 from sim_server.network.leases import InFlightJob
 from sim_server.network.send_queue import SendQueue
@@ -27,6 +30,9 @@ from sim_server.updates.factor_source import Job
 
 FAST_SEND = 0.05  # s in which a fast link takes a job as bytes; zenoh drops what is not taken within 0.25 s
 BEHIND = 10.0  # s of a lease, at most, for what waits at a worker behind a first job, which has a longer one
+LEAST_ON_DEVICE = (
+    1 << 20
+)  # bytes of a factor; what has no more crosses the host in less time than the device needs to answer
 MAX_SENT = 4096  # times of jobs that are remembered
 SLOT_MARGIN = 8  # the slot for an incomplete factor is larger than the largest factor so far by a SLOT_MARGIN-th
 
@@ -43,7 +49,10 @@ class JobSender:
     """Sends jobs through a queue, so that nobody waits for the network.
 
     pool: shared memory for arrays; None: they travel as bytes
+    device: device memory for matrices and factors of workers beside it; None: there is none
     """
+
+    device: DeviceSlots | None = None
 
     def __init__(
         self, session: zenoh.Session, server: str, incarnation: int, pool: SlotPool | None, queue: SendQueue,
@@ -152,10 +161,8 @@ class JobSender:
         if slots is None:
             return [self._send_alone(worker, job) for job in jobs]
         seconds = [leases.lease(job.object, worker, job.method.name) for job in jobs]
-        in_flight = [
-            self._begin(job, worker, lease, slots, factor_slot=slots[1], first=entry.first, room=entry.room)
-            for job, lease, entry in zip(jobs, seconds, entries, strict=True)
-        ]
+        rooms = [(entry.first, entry.room) for entry in entries]
+        in_flight = self._begin(jobs, worker, seconds, slots, slots[1], rooms)
         message = batch_message(entries, in_flight, seconds, self._incarnation, *slots)
         filling, matrices = Filling(slots), [job.values for job in jobs]
         if self._queue.post(partial(self._fill_and_put, message, matrices, in_flight, filling)):
@@ -194,12 +201,14 @@ class JobSender:
     # ---- a job alone -----------------------------------------------------------------------------------------
 
     def _send_alone(self, worker: str, job: Job) -> bool:
+        if (on_device := self._lend_on_device(worker, job)) is not None:
+            return self._send_on_device(worker, job, *on_device)
         matrix_slot, factor_slot = self._allocate(worker, job)
         known = self._book.decoder.objects[job.object]
         lease = self._book.leases.lease(job.object, worker, job.method.name, job.positions, known.blocks)
         slots = tuple(slot for slot in (matrix_slot, factor_slot) if slot is not None)
         payload_bytes = 0 if matrix_slot else job.values.nbytes
-        in_flight = self._begin(job, worker, lease, slots, factor_slot=factor_slot, payload_bytes=payload_bytes)
+        (in_flight,) = self._begin([job], worker, [lease], slots, factor_slot, [(0, 0)], payload_bytes)
         message = matrix_message(in_flight, known, self._incarnation, lease, job.method)
         payload = add_values(message, job.values, matrix_slot)
         name, attachment = key("matrix", self._server, worker=worker, object=job.object), message.SerializeToString()
@@ -208,6 +217,37 @@ class JobSender:
             return True
         self._book.leases.cancel(in_flight)
         return False
+
+    def _lend_on_device(self, worker: str, job: Job) -> list[DeviceSlot] | None:
+        """Lends slots of device memory for a matrix and its factor, whose size must be known; None: they travel through
+        the host."""
+        size = self._book.decoder.objects[job.object].most_values(job.method.name) * np.dtype(job.dtype).itemsize
+        able = self.device is not None and self._choice.shares_device(worker)
+        if not able or self.device is None or job.positions or job.method.name != COMPLETE or size <= LEAST_ON_DEVICE:
+            return None
+        return self.device.lend([job.values.nbytes, size])
+
+    def _send_on_device(self, worker: str, job: Job, matrix: DeviceSlot, factor: DeviceSlot) -> bool:
+        known, leases = self._book.decoder.objects[job.object], self._book.leases
+        lease = leases.lease(job.object, worker, job.method.name, blocks=known.blocks)
+        (in_flight,) = self._begin([job], worker, [lease], (matrix, factor), None, [(0, 0)], device_slot=factor)
+        message = matrix_message(in_flight, known, self._incarnation, lease, job.method)
+        message.device_matrix.CopyFrom(matrix.message())
+        if self._queue.post(partial(self._put_on_device, in_flight, job, message, matrix)):
+            self._on_sent(worker, [job])
+            return True
+        leases.cancel(in_flight)
+        return False
+
+    def _put_on_device(self, in_flight: InFlightJob, job: Job, message: Matrix, matrix: DeviceSlot) -> None:
+        """Copies a matrix within the device and sends its job, in the thread of the queue."""
+        device, factor = self.device, in_flight.device_slot
+        assert device is not None and factor is not None
+        for slot, told in ((matrix, message.device_matrix), (factor, message.device_factor)):
+            device.mark(slot, told.generation)
+        device.memory.put(matrix.address, [PlacedMatrix(job.values, job.on_device)])
+        name = key("matrix", self._server, worker=in_flight.worker, object=in_flight.object)
+        self._put([in_flight], name, zenoh.ZBytes(b""), message.SerializeToString(), True)
 
     def _allocate(self, worker: str, job: Job) -> tuple[Slot | None, Slot | None]:
         """Allocates slots for the matrix and its factor; None for an array that must travel as bytes, as the first
@@ -218,7 +258,7 @@ class JobSender:
         if job.method.name == "incomplete_cholesky":
             nonzeros += nonzeros // SLOT_MARGIN  # the next factor may keep more blocks
         size = nonzeros * np.dtype(job.dtype).itemsize
-        if size > max(WHOLE_PARTS * PART_BYTES, self._pool.limit // SLOT_SHARE):
+        if not self._fits_slot(size):
             size = 0  # it comes in parts
         pool, sizes = self._pool, [job.values.nbytes, *([size] if size else [])]
         slots = [pool.lend(each, beside=True) for each in sizes]
@@ -227,38 +267,48 @@ class JobSender:
         matrix, factor = [*slots, None][:2]
         return matrix, factor
 
+    def _fits_slot(self, size: int) -> bool:
+        """True if a factor of so many bytes may come in a slot."""
+        return self._pool is not None and size <= max(WHOLE_PARTS * PART_BYTES, self._pool.limit // SLOT_SHARE)
+
+    def prepare_for(self, pattern: FactorPattern) -> None:
+        """Has the slot for a large factor, or for its parts, made beside the caller before its first job."""
+        if self._pool is not None:
+            self._pool.prepare(size if self._fits_slot(size := 4 * pattern.nonzeros) else PART_BYTES)
+        if self.device is not None and 4 * pattern.nonzeros > LEAST_ON_DEVICE:
+            self.device.prepare(4 * pattern.nonzeros)
+
     # ---- both ------------------------------------------------------------------------------------------------
 
     def _begin(
-        self, job: Job, worker: str, lease: float, slots: tuple[Slot, ...], factor_slot: Slot | None, **more: int
-    ) -> InFlightJob:
-        """Begins the lease of a job that is being sent. more: fields of InFlightJob"""
-        now, leases = self._book.clock(), self._book.leases
-        in_flight = InFlightJob(
-            leases.next_number(),
-            job.object,
-            job.epoch,
-            job.step,
-            job.warp,
-            _dtype_name(job.dtype),
-            worker,
-            deadline=now + max(lease, min(leases.deadlines().get(worker, 0.0) - now, BEHIND)),
-            factor_slot=factor_slot,
-            factor_generation=factor_slot.generation if factor_slot else 0,
-            slots=slots,
-            sent_at=now,
-            exclusive_until=now + leases.exclusive_period(job.object, self._book.decoder.objects[job.object].blocks),
-            method=job.method.name,
-            positions=job.positions,
-            part_bytes=PART_BYTES,
-            **more,
-        )
-        leases.start(in_flight)
-        return in_flight
+        self, jobs: Sequence[Job], worker: str, seconds: Sequence[float], slots: tuple[Slot | DeviceSlot, ...],
+        factor_slot: Slot | None, rooms: Sequence[tuple[int, int]], payload_bytes: int = 0,
+        device_slot: DeviceSlot | None = None,
+    ) -> list[InFlightJob]:  # fmt: skip
+        """Begins the leases of jobs that are being sent together.
+
+        seconds: that the worker has for each. rooms: first byte and bytes of each in the slot of the factors
+        """
+        now, leases, objects = self._book.clock(), self._book.leases, self._book.decoder.objects
+        latest, generation = leases.deadlines().get(worker, 0.0), factor_slot.generation if factor_slot else 0
+        begun: list[InFlightJob] = []
+        for job, lease, (first, room) in zip(jobs, seconds, rooms, strict=True):
+            deadline = now + max(lease, min(latest - now, BEHIND))
+            latest = max(latest, deadline)
+            begun.append(
+                InFlightJob(
+                    leases.next_number(), job.object, job.epoch, job.step, job.warp, _dtype_name(job.dtype), worker,
+                    deadline, factor_slot, generation, slots, first, room, now,
+                    now + leases.exclusive_period(job.object, objects[job.object].blocks), job.method.name,
+                    payload_bytes, job.positions, PART_BYTES, device_slot,
+                    device_slot.generation if device_slot else 0,
+                )
+            )  # fmt: skip
+        leases.start_all(begun)
+        return begun
 
     def _on_sent(self, worker: str, jobs: Sequence[Job]) -> None:
-        for job in jobs:
-            self._book.last_worker[job.object] = worker
+        self._book.last_worker.update((job.object, worker) for job in jobs)
         self._book.reliability.on_sent(worker, self._book.clock())
         self._counters.add("jobs", len(jobs))
         self._counters.add("bytes_out", sum(job.values.nbytes for job in jobs))
@@ -282,8 +332,9 @@ class JobSender:
         )
         if not drop and time.perf_counter() - begin < FAST_SEND:
             self._fast_links.add(worker)
+        now = self._book.clock()
         for job in jobs:
-            self._sent[job.number] = self._book.clock()
+            self._sent[job.number] = now
 
 
 @cache

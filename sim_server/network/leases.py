@@ -4,12 +4,14 @@
 Pure bookkeeping, without network or clock.
 """
 
-from collections.abc import Callable
+from collections import Counter
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
 from protocol.refused import Refused
 from protocol.shared_memory.pool import Slot
+from sim_server.network.device_slots import DeviceSlot
 
 MIN_LEASE = 2.0  # s
 MAX_LEASE = 120.0  # s; also for the first job of an object at a worker, which may compile, import and analyse for it
@@ -27,22 +29,23 @@ MAX_EXPIRED = 2  # expired jobs with which a worker still gets slots of shared m
 class SlotAllocator(Protocol):
     """The pool that slots go back to."""
 
-    def give_back(self, slot: Slot) -> None:
-        """Frees a slot."""
+    def give_back(self, slot: Slot | DeviceSlot, users: int = 1) -> None:
+        """Frees a slot that so many jobs used."""
 
 
-@dataclass(frozen=True)
+@dataclass(eq=False, slots=True)
 class InFlightJob:
-    """A job sent to one worker. Times are monotonic [s].
+    """A job sent to one worker, which does not change. Times are monotonic [s].
 
     number: of the job, unique in the life of the server
     sent_at, deadline: begin and end of its lease
     exclusive_until: from then on another worker may be asked for the object
-    slots: shared memory allocated for the matrix and the factor
+    slots: shared memory allocated for the matrix and the factor, of the host or of a device
     room: bytes of the factor slot that are for this job, from `first` on
     payload_bytes: size of the values if they are in no slot
     positions: they are positions, from which the worker assembles the matrix
     part_bytes: of each part of a factor that travels in parts
+    device_slot, device_generation: in place of factor_slot, of a device
     """
 
     number: int
@@ -55,7 +58,7 @@ class InFlightJob:
     deadline: float
     factor_slot: Slot | None = None
     factor_generation: int = 0
-    slots: tuple[Slot, ...] = ()
+    slots: tuple[Slot | DeviceSlot, ...] = ()
     first: int = 0
     room: int = 0
     sent_at: float = 0.0
@@ -64,6 +67,8 @@ class InFlightJob:
     payload_bytes: int = 0
     positions: bool = False
     part_bytes: int = 0
+    device_slot: DeviceSlot | None = None
+    device_generation: int = 0
 
 
 class Leases:
@@ -115,26 +120,34 @@ class Leases:
 
     def start(self, job: InFlightJob) -> None:
         """Adds a job that is being sent."""
-        self.by_object[job.object] = job
-        self.by_worker.setdefault(job.worker, {})[job.number] = job
-        self._next_deadline = min(self._next_deadline, job.deadline)
+        self.start_all([job])
+
+    def start_all(self, jobs: Sequence[InFlightJob]) -> None:
+        """Adds jobs that are being sent to one worker."""
+        worker, deadlines = jobs[0].worker, [job.deadline for job in jobs]
+        self.by_object.update((job.object, job) for job in jobs)
+        self.by_worker.setdefault(worker, {}).update((job.number, job) for job in jobs)
+        self._next_deadline = min(self._next_deadline, *deadlines)
         if self._deadlines is not None:
-            self._deadlines[job.worker] = max(self._deadlines.get(job.worker, job.deadline), job.deadline)
+            self._deadlines[worker] = max(self._deadlines.get(worker, deadlines[0]), *deadlines)
 
     def cancel(self, job: InFlightJob) -> None:
         """Removes a job that was never sent."""
         del self.by_object[job.object]
-        self._drop(job)
-        self._free_slots(job)
+        self._drop([job])
+        self._free_slots([job])
 
-    def _drop(self, job: InFlightJob) -> None:
-        """Removes a job from those of its worker."""
-        jobs = self.by_worker.get(job.worker, {})
-        jobs.pop(job.number, None)
-        if self._deadlines is not None and job.deadline >= self._deadlines.get(job.worker, job.deadline):
+    def _drop(self, dropped: Sequence[InFlightJob]) -> None:
+        """Removes jobs from those of their worker."""
+        worker = dropped[0].worker
+        jobs = self.by_worker.get(worker, {})
+        for job in dropped:
+            jobs.pop(job.number, None)
+        latest = max(job.deadline for job in dropped)
+        if self._deadlines is not None and latest >= self._deadlines.get(worker, latest):
             self._deadlines = None  # the latest one may be another now
         if not jobs:
-            self.by_worker.pop(job.worker, None)
+            self.by_worker.pop(worker, None)
             self._deadlines = None
 
     def count(self, worker: str) -> int:
@@ -189,14 +202,28 @@ class Leases:
         """
         if self.by_object.get(job.object) is job:
             del self.by_object[job.object]
-        self._drop(job)
+        self._drop([job])
         self._reassigned.discard(job.number)
-        self._free_slots(job)
+        self._free_slots([job])
         self._free_expired(job.worker, job.number)
         if seconds is not None:
             self._seconds.setdefault(job.object, {})[job.worker] = seconds
             self._answered.setdefault((job.object, job.worker), set()).add((job.method, job.positions))
             self._doublings.pop((job.object, job.worker), None)
+
+    def finish_all(self, jobs: Sequence[InFlightJob], seconds: Sequence[float]) -> None:
+        """Removes jobs of one worker that it has answered with factors in one message, as `finish` does each."""
+        worker = jobs[0].worker
+        for job, lasted in zip(jobs, seconds, strict=True):
+            if self.by_object.get(job.object) is job:
+                del self.by_object[job.object]
+            self._seconds.setdefault(job.object, {})[worker] = lasted
+            self._answered.setdefault((job.object, worker), set()).add((job.method, job.positions))
+            self._doublings.pop((job.object, worker), None)
+        self._drop(jobs)
+        self._reassigned.difference_update(job.number for job in jobs)
+        self._free_slots(jobs)
+        self._free_expired(worker, max(job.number for job in jobs))
 
     def expire(self, now: float, is_answered: Callable[[InFlightJob], bool] = lambda job: False) -> list[InFlightJob]:
         """Ends the leases that are over: objects and workers are free again, the slots are not. Returns the jobs.
@@ -221,7 +248,7 @@ class Leases:
 
         lost = []
         for worker, jobs in self.by_worker.items():
-            if (period := idle(worker)) is not None:
+            if (period := idle(worker)) is not None and period[1] - period[0] > DELIVERY:
                 since = [(job, period[1] - max(period[0], sent_at(job))) for job in jobs.values()]
                 lost += [job for job, seconds in since if seconds > self.delivery_time(job)]
         return self._expire(lost)
@@ -233,7 +260,7 @@ class Leases:
 
     def _expire(self, over: list[InFlightJob]) -> list[InFlightJob]:
         for job in over:
-            self._drop(job)
+            self._drop([job])
             self._reassigned.discard(job.number)
             pair = job.object, job.worker
             self._doublings[pair] = min(MAX_DOUBLINGS, self._doublings.get(pair, 0) + 1)
@@ -254,7 +281,7 @@ class Leases:
     def remove_worker(self, worker: str) -> list[InFlightJob]:
         """Frees all slots of a worker that left; returns its jobs that are of the present epoch of their objects."""
         for old in self._expired.pop(worker, []):
-            self._free_slots(old)
+            self._free_slots([old])
         for seconds in self._seconds.values():
             seconds.pop(worker, None)
         for known in (self._doublings, self._answered):
@@ -264,7 +291,7 @@ class Leases:
         self._deadlines = None
         for job in jobs:
             self._reassigned.discard(job.number)
-            self._free_slots(job)
+            self._free_slots([job])
         lost = [job for job in jobs if self.by_object.get(job.object) is job]
         for job in lost:
             del self.by_object[job.object]
@@ -283,9 +310,9 @@ class Leases:
         expired = self._expired.get(worker, [])
         for old in [old for old in expired if old.number <= number]:
             expired.remove(old)
-            self._free_slots(old)
+            self._free_slots([old])
 
-    def _free_slots(self, job: InFlightJob) -> None:
+    def _free_slots(self, jobs: Sequence[InFlightJob]) -> None:
         if self._allocator is not None:
-            for slot in job.slots:
-                self._allocator.give_back(slot)
+            for slot, users in Counter(slot for job in jobs for slot in job.slots).items():
+                self._allocator.give_back(slot, users)

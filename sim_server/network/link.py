@@ -7,6 +7,7 @@ until they are read. Methods are for the service thread, except `close`; those o
 
 import logging
 import secrets
+import sys
 import time
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
@@ -38,6 +39,8 @@ from protocol.network.session import open_session
 from protocol.refused import Refused
 from protocol.shared_memory.limits import POOL_LIMIT
 from protocol.shared_memory.pool import Slot, SlotPool, SlotsUnusable
+from sim_server.backends.shared_memory import SharedMemory
+from sim_server.network.device_slots import DeviceSlots
 from sim_server.network.dispatch import Dispatch
 from sim_server.network.name_claim import NameClaim
 from sim_server.network.publishers import Publishers
@@ -46,6 +49,7 @@ from sim_server.network.send_queue import SendQueue
 
 log = logging.getLogger(__name__)
 
+SWITCH_SECONDS = 5e-4  # for which a thread may keep Python's lock while the thread that serves the loop wants it back
 TOKENS = 4096  # liveliness tokens of clients that may wait to be read
 REPLIES = 1024  # replies to commands that may wait to be sent
 
@@ -83,6 +87,7 @@ class ServerLink:
         clock: Callable[[], float] = time.monotonic,
     ):
         self.name = check_name(name, "server name")
+        sys.setswitchinterval(min(SWITCH_SECONDS, sys.getswitchinterval()))
         self.incarnation = secrets.randbits(63) | 1
         self.counters = Counters(log)
         self.local_workers: Callable[[], list[LocalWorker]] = list
@@ -154,6 +159,16 @@ class ServerLink:
     def slots_lent(self) -> int:
         """Number of slots lent to jobs now. A probe for tests."""
         return self._pool.lent - 1 if self._pool is not None else 0  # one is for shm_probe
+
+    def share_device(self, memory: SharedMemory) -> None:
+        """Has matrices and factors stay in device memory where a worker can open it: one on this host, of this user.
+        Not without shared memory of the host, by which it is known to be."""
+        slots = DeviceSlots(memory)
+        if self._pool is None or not slots.usable:
+            return slots.close()
+        self._closing.callback(slots.close)
+        self.dispatch.share_device(slots)
+        self._queryables.device = slots
 
     def announce(self, topology: Topology) -> None:
         """Begins a new epoch of an object: sends its topology to all and offers it to those who join later."""
@@ -248,6 +263,7 @@ class ServerLink:
         status.workers.extend(self.dispatch.workers())
         status.clients.extend(self.clients())
         status.bulk_shared, status.bulk_copied = self.counters.bulk_shared, self.counters.bulk_copied
+        status.bulk_on_device = self.counters.bulk_on_device
         status.refused = self.counters.refused
         status.commands_refused, status.moves_replaced = self.counters.commands_refused, self.counters.moves_replaced
         status.bulk_bytes_out, status.bulk_bytes_in = self.counters.bytes_out, self.counters.bytes_in

@@ -19,6 +19,7 @@ from protocol.shared_memory.pool import Slot
 from protocol.validate import check_header, check_numbers, check_strings, parse
 from sim_server.network.coalesce import coalesce_moves
 from sim_server.network.command_queue import CommandQueue, PendingCommand
+from sim_server.network.device_slots import DeviceSlots
 from sim_server.network.name_claim import NameClaim
 from sim_server.network.send_queue import SendQueue
 
@@ -44,7 +45,10 @@ class Queryables:
 
     probe_slot: shared memory with which workers probe whether they can use it; None: there is none
     rights: which commands are whose
+    device: device memory, likewise
     """
+
+    device: DeviceSlots | None = None
 
     def __init__(
         self, session: Session, server: str, incarnation: int, counters: Counters, probe_slot: Slot | None,
@@ -132,7 +136,12 @@ class Queryables:
         question = parse(Echo, query.payload, CHANNELS["echo"].limit)
         if question.header.protocol != PROTOCOL:
             self._warn_of_version(query, question)
-        if self._probe_slot is None or not question.nonce or question.header.protocol != PROTOCOL:
+        if question.on_device and self.device is not None and question.header.protocol == PROTOCOL:
+            reply = self.device.answer(question, self._incarnation)
+            query.reply(query.key_expr, b"", attachment=reply.SerializeToString())
+            return
+        asks = bool(question.nonce) and question.header.protocol == PROTOCOL and not question.on_device
+        if self._probe_slot is None or not asks:
             header = Header(protocol=PROTOCOL, incarnation=self._incarnation)
             query.reply(
                 query.key_expr, b"", attachment=Echo(header=header, settled=self._claim.settled).SerializeToString()

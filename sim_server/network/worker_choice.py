@@ -33,7 +33,8 @@ class WorkerChoice:
         """Number of jobs that a worker can take beside those it has.
 
         Several wait at a worker only where all objects are small and arrays are in shared memory, as many as it does
-        within QUEUE_SECONDS: it then need not wait for the network after each, and may factorize them together.
+        within QUEUE_SECONDS: it then need not wait for the network after each, and may factorize them together. What it
+        does together is not divided: fewer would take it as long.
         """
         return max(0, self.most_waiting(worker) - self._waiting(worker))
 
@@ -44,7 +45,9 @@ class WorkerChoice:
         small = self._book.decoder.most_blocks <= SMALL_BLOCKS and self._shared
         if info is not None and info.shared_memory and seconds is not None and small:
             most = MOST_BATCHES * MOST_TOGETHER if info.batches and self._book.decoder.most_are_sized else MOST_ALONE
-            most = max(1, min(info.most_jobs, most, int(QUEUE_SECONDS / max(seconds, 1e-6))))
+            in_time, together = int(QUEUE_SECONDS / max(seconds, 1e-6)), min(info.together, MOST_TOGETHER)
+            in_time = max(in_time, MOST_BATCHES * together if together > 1 else 1)
+            most = max(1, min(info.most_jobs, most, in_time))
         return most
 
     def rooms(self) -> dict[str, int]:
@@ -76,6 +79,11 @@ class WorkerChoice:
         info = self._book.registry.info(worker)
         expired = self._book.leases.expired_count(worker)
         return self._shared and info is not None and info.shared_memory and expired < MAX_EXPIRED
+
+    def shares_device(self, worker: str) -> bool:
+        """True if a worker opens device memory of this server: only one on this host, of the same user, is asked to."""
+        info = self._book.registry.info(worker)
+        return info is not None and info.device_memory and self.has_slots(worker)
 
     def takes_batches(self, worker: str) -> bool:
         """True if several jobs of a worker may share a message. It has room for several only where all objects are

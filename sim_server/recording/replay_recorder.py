@@ -16,7 +16,6 @@ import numpy as np
 
 from protocol import messages_pb2 as pb
 from protocol.factor import Factor
-from protocol.validate import checksum
 from sim_server.arrays import Float64
 from sim_server.backends.base import PendingUpdate
 from sim_server.effects._base import Effect
@@ -58,13 +57,13 @@ class ReplayRecorder:
 
     def __init__(self, driver: Driver, link: ServerLink, recorder: Recorder):
         self._driver, self._link, self._recorder = driver, link, recorder
-        self._factors: deque[Factor] = deque()  # appended by the thread that posts them, maybe the loop's
+        self._factors: deque[tuple[Factor, pb.WorkerInfo]] = deque()  # with their makers; appended by who posts them
         self._touched: Updates[list[Interaction]] = deque(maxlen=PENDING)
         movers = [m for m in (driver.simulation.contact, driver.simulation.holders) if m is not None]
         self._movers: dict[Movable, Updates[dict[str, Float64]]] = {m: deque(maxlen=PENDING) for m in movers}
         self._with_nodes: set[int] = set()  # ids of the interactions of the last list; the log holds their nodes
-        self._workers: dict[str, pb.WorkerInfo] = {}  # makers of factors, oldest first
-        driver.on_adopt.append(self._factors.append)
+        self._workers: dict[str, pb.WorkerInfo] = {}  # makers of factors, the one of the newest last
+        driver.on_adopt.append(lambda factor: self._factors.append((factor, self._maker(factor))))
         self._touch = driver.simulation.touch
         driver.simulation.on_effect_update.append(self._on_update)
         self._parameters: deque[ParameterUpdate] = deque()
@@ -86,7 +85,7 @@ class ReplayRecorder:
     def write(self, block: bool) -> None:
         """Writes all that was taken up since the last call; so a log that is cut off holds the inputs of its steps."""
         for _ in range(len(self._factors)):
-            self._recorder.factor(self._factor(self._factors.popleft()), block)
+            self._recorder.factor(self._factor(*self._factors.popleft()), block)
         for step, interactions in _taken(self._touched):
             self._recorder.touch_set(self._touch_set(step, interactions), self._dt * step, block)
         while self._parameters and self._parameters[0].taken >= 0:
@@ -110,20 +109,29 @@ class ReplayRecorder:
         self._with_nodes = {a.id for a in interactions}  # one that has left a list is in none after it
         return found
 
-    def _factor(self, factor: Factor) -> pb.FactorUse:
-        if factor.worker == self._driver.inline.WORKER:
-            maker = pb.WorkerInfo(worker=factor.worker, library=self._driver.inline.library(factor.object), threads=1)
-        else:
-            if factor.worker not in self._workers:
-                self._workers.update({w.worker: w for w in self._link.dispatch.workers()})
-                for name in list(self._workers)[:-MAKERS]:
-                    del self._workers[name]
-            maker = self._workers.get(factor.worker, pb.WorkerInfo(worker=factor.worker))
+    def _maker(self, factor: Factor) -> pb.WorkerInfo:
+        """Returns what the worker of a factor last said of itself: one that is started again may have another library.
+
+        Of one that has left since, what it had said when its last factor came.
+        """
+        name = factor.worker
+        if name == self._driver.inline.WORKER:
+            return pb.WorkerInfo(worker=name, library=self._driver.inline.library(factor.object), threads=1)
+        maker = self._link.dispatch.worker_info(name)
+        if maker is None:
+            return self._workers.get(name, pb.WorkerInfo(worker=name))
+        self._workers.pop(name, None)
+        self._workers[name] = maker
+        if len(self._workers) > MAKERS:
+            del self._workers[next(iter(self._workers))]
+        return maker
+
+    def _factor(self, factor: Factor, maker: pb.WorkerInfo) -> pb.FactorUse:
         exact = factor.method in ("", EXACT.name)
         library = maker.library if exact else "native"
         return pb.FactorUse(
             header=pb.Header(object=factor.object, epoch=factor.epoch), step=factor.step, pattern=factor.pattern.id,
-            checksum=checksum(factor.values), dtype=factor.values.dtype.name, worker=factor.worker,
+            checksum=factor.checksum(), dtype=factor.values.dtype.name, worker=factor.worker,
             library=library, threads=maker.threads, seconds=factor.seconds, remedy=factor.remedy,
             method=factor.method, ahead=factor.ahead, later=factor.later,
         )  # fmt: skip

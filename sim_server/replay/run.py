@@ -8,14 +8,11 @@ What is left (kernels, solver, factorization) is a pure function of these on one
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
-from importlib.util import find_spec
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import ValidationError
 
 from protocol import messages_pb2 as pb
 from protocol.factor import Factor
@@ -23,28 +20,22 @@ from protocol.log_chunks import BadLog
 from protocol.refused import Refused
 from protocol.validate import array, check_range, checksum
 from sim_server.arrays import Float64
-from sim_server.backends.processor_variants import advice
 from sim_server.checkpoint.content import SavedFactors, restore, saved_factors
 from sim_server.checkpoint.file import from_bytes
-from sim_server.errors import DeviceError, InputError
+from sim_server.errors import InputError
 from sim_server.mechanics.world import Body
 from sim_server.recording import messages
-from sim_server.recording.obstacles import obstacle_messages, targets_of
+from sim_server.recording.obstacles import targets_of
+from sim_server.replay.library import inline_source
 from sim_server.replay.log import Recording
+from sim_server.replay.rebuilding import check_meshes, check_obstacles, other_code, simulation_of
 from sim_server.replay.report import Comparison
-from sim_server.scene import Scene, deleted, earlier_defaults
-from sim_server.scene.messages import readable
-from sim_server.simulation import Simulation
-from sim_server.state import code
 from sim_server.state.start import Start
-from sim_server.updates.factor_source import Inline, Job
-from sim_server.updates.patterns import Patterns
-from sim_server.updates.worker_assembly import Assembly, mesh_of_topology
+from sim_server.updates.factor_source import Job
+from sim_server.updates.worker_assembly import Assembly
 
 if TYPE_CHECKING:
     from sim_server.effects.touch import Interaction
-
-MESH = ("nodes", "tets", "row_start", "columns", "fixed")
 
 
 class Replay:
@@ -52,35 +43,30 @@ class Replay:
 
     def __init__(self, recording: Recording):
         self.recording = recording
-        try:
-            table = _without_skins(deleted.without(earlier_defaults.named(json.loads(recording.scene.resolved))))
-            if table.get("solver", {}).get("warp") == "auto":
-                table["solver"]["warp"] = True
-                recording.notes.append(
-                    'recorded with warp = "auto", repeated with true: steps that were tried without may differ'
-                )
-            scene, watched = self._scene(table), "on_runaway" in table.get("solver", {})
-        except ValidationError as error:
-            reason, software = str(readable(error, f"in {recording.path.name}", table)), recording.scene.software
-            reason += f"; recorded with {software}" if " effect " in software else ""
-            raise BadLog(f"{recording.path}: the scene in the log cannot be built: {reason}") from error
-        except ValueError as error:
-            raise BadLog(f"{recording.path}: the scene in the log cannot be built: {error}") from error
-        try:
-            self.simulation = Simulation(scene, recording.device, watched)
-        except DeviceError as error:
-            raise BadLog(
-                f"{recording.path}: recorded on a GPU ({recording.scene.software}), and only one can run it again: "
-                f"{error}"
-            ) from error
+        self.simulation = simulation_of(recording)
         self.engine, self.bodies = self.simulation.engine, self.simulation.world.bodies
         self.compared = Comparison(recording)
-        self._same_obstacles()
+        check_obstacles(self.simulation, recording)
+        self._list_inputs()
+        self.engine.prepare()  # as a server, with the parameters of the scene
+        self._start = Start(self.simulation) if self._resets else None
+        self._saved = SavedFactors([], [])
+        if recording.checkpoint:
+            self._resume(recording)
+        check_meshes(self.simulation, recording)
+        self._nodes: dict[int, tuple[NDArray[np.int32], Float64]] = {}  # nodes and offsets of interactions, by id
+        self._positions: dict[str, Float64] = {}  # sent instead of a matrix, and not those of its step, by body
+        self._later: dict[str, Float64] = {}  # those at the end of the last step
+        self._assemblies: dict[str, Assembly] = {}
+        self._begin_factors()
+        self.compared.notes += other_code(self.simulation, recording)
+
+    def _list_inputs(self) -> None:
+        """Lists what the log holds by the step in which it takes effect."""
+        recording = self.recording
         self._taken = {b.name: taken_up(self._rows(b.name), recording.first) for b in self.bodies}
         self._last_use = self._last_uses()
         self._needed = set(self._last_use)  # (object, step) of matrices whose factor the loop used
-        self._factors: dict[tuple[str, int], Factor] = {}
-        self._in_use: dict[str, int] = {}
         self._touch_sets: dict[int, pb.TouchSet] = {t.step: t for t in recording.touch}
         self._targets: dict[int, list[pb.ObstacleTargets]] = {}
         for t in recording.targets:
@@ -88,29 +74,17 @@ class Replay:
         self._resets: dict[int, list[tuple[str, int]]] = {}  # by step: objects, parameter sets before
         for r, sets in recording.resets:
             self._resets.setdefault(r.step, []).append((r.header.object, sets))
-        self.engine.prepare()  # as a server, with the parameters of the scene
-        self._start = Start(self.simulation) if self._resets else None
-        self._saved = SavedFactors([], [])
-        if recording.checkpoint:
-            self._resume(recording)
-        self._same_meshes()
-        self._nodes: dict[int, tuple[NDArray[np.int32], Float64]] = {}  # nodes and offsets of interactions, by id
-        self._inline = self._library()
-        self._positions: dict[str, Float64] = {}  # sent instead of a matrix, and not those of its step, by body
-        self._later: dict[str, Float64] = {}  # those at the end of the last step
-        self._assemblies: dict[str, Assembly] = {}
-        for factor in self._saved.factors:
-            self._factors[factor.object, factor.step] = factor
+
+    def _begin_factors(self) -> None:
+        """Has the library of the log make factors, beginning with those that were under way in a checkpoint."""
+        self._inline, note = inline_source(self.simulation, self.recording)
+        self.compared.notes += [note] if note else []
+        self._factors: dict[tuple[str, int], Factor] = {(f.object, f.step): f for f in self._saved.factors}
+        self._in_use: dict[str, int] = {}
         for job in self._saved.jobs:
             if (job.object, job.step) in self._needed:
                 self._inline.submit(job)
-        self._collect(recording.first)
-        self._same_effects()
-        if code.build_id(self.simulation) != recording.scene.build and recording.scene.build:
-            self.compared.notes.append(
-                "another build than the recorded one (kernels, compiler, processor or GPU): last digits may differ"
-                + advice(recording.scene.build)
-            )
+        self._collect(self.recording.first)
 
     def _resume(self, recording: Recording) -> None:
         """Goes to where the recorded run began: the checkpoint of the log."""
@@ -169,66 +143,6 @@ class Replay:
             for step, both in enumerate(self._taken[body.name].tolist(), self.recording.first):
                 uses |= {(body.name, made): step for made in both if made >= 0}
         return uses
-
-    def _scene(self, table: dict[str, Any]) -> Scene:
-        """Returns the validated scene of the log; meshes that were made by filling a surface are those of the log, so
-        neither surface nor mesher is needed."""
-        listed = table["object"] if isinstance(table.get("object"), list) else []
-        meshes = [o.get("mesh") for o in listed if isinstance(o, dict)]
-        filled = any(isinstance(mesh, dict) and mesh.get("surface") for mesh in meshes)
-        scene = Scene.model_validate(table, context={"files": "known"} if filled else None)
-        for o in scene.objects if filled else ():
-            recorded = self.recording.objects.get(o.name)
-            if o.mesh.surface is not None and recorded is not None and recorded.topology is not None:
-                o.use_mesh(mesh_of_topology(recorded.topology))
-        return scene
-
-    def _same_meshes(self) -> None:
-        if [b.name for b in self.bodies] != list(self.recording.scene.objects):
-            raise BadLog(f"{self.recording.path}: the scene in the log has other objects than the log")
-        for body in self.bodies:
-            now, then = messages.topology(self.simulation, body), self.recording.objects[body.name].topology
-            assert then is not None
-            other = [name for name in MESH if getattr(now, name) != getattr(then, name)]
-            if not other and not np.allclose(np.frombuffer(now.rest), np.frombuffer(then.rest), rtol=1e-9, atol=1e-12):
-                other = ["rest"]
-            if other:
-                file = self.simulation.scene.objects[body.index].mesh.file
-                raise BadLog(
-                    f"{self.recording.path}: the mesh of object {body.name!r} is not the recorded one "
-                    f"({', '.join(other)}){f'; was {file} changed?' if file else ''}"
-                )
-
-    def _same_effects(self) -> None:
-        """Notes effects of other packages that are not the recorded ones."""
-        for other in code.codes(self.simulation):
-            if str(other) not in self.recording.scene.software:
-                self.compared.notes.append(
-                    f"{other} is not the code of the log: recorded with {self.recording.scene.software}"
-                )
-
-    def _same_obstacles(self) -> None:
-        for now in obstacle_messages(self.simulation):
-            then = self.recording.obstacles.get(now.header.object)
-            if then is not None and (now.vertices, now.triangles) != (then.vertices, then.triangles):
-                raise BadLog(
-                    f"{self.recording.path}: the surface of obstacle {now.header.object!r} is not the recorded one; "
-                    "was its file changed?"
-                )
-
-    def _library(self) -> Inline:
-        """Returns a source of factors that uses the library named in the log, if it is installed."""
-        made = [f for o in self.recording.objects.values() for f in o.factors.values()]
-        recorded = {f.library for f in made if f.library} - {"native"}  # which is everywhere
-        wanted = {_library(name) for name in recorded}
-        choice = wanted.pop() if len(wanted) == 1 else "auto"
-        if not _usable(choice):
-            choice = "auto"
-        if wanted or (recorded and choice == "auto"):
-            self.compared.notes.append(
-                f"factors of the log were made by {', '.join(sorted(recorded))}; here by another"
-            )
-        return Inline(Patterns.of(self.simulation), choice)
 
     # --- input of a step ----------------------------------------------------------------------------------------
 
@@ -394,34 +308,3 @@ def taken_up(rows: NDArray[np.void], first: int = 0) -> NDArray[np.int64]:
     and made from the very step; -1: none. rows: of a log (log.ROW), one a step. first: steps before them."""
     used, fresh = rows["factor_step"], rows["factor_step"] == first + np.arange(len(rows))
     return np.stack([np.where(fresh, -1, used), np.where(fresh, used, -1)], axis=1)
-
-
-def _without_skins(resolved: Any) -> Any:
-    """Returns a resolved scene without skins: no step depends on them, and the log has them."""
-    for each in resolved.get("object", ()) if isinstance(resolved, dict) else ():
-        if isinstance(each, dict):
-            each.pop("skin", None)
-    return resolved
-
-
-def _library(name: str) -> str:
-    """Option of Analysis for a library as named in a log, such as "cholmod 3.0.14" or "NVIDIA H200, float64"."""
-    from precond_worker.factorization.factorize import ON_CPU
-
-    gpu = next((f"gpu-{kind}" for kind in ("float32", "float64") if name.endswith(f", {kind}")), "")
-    return gpu or next((known for known in ON_CPU if name.split()[0] == known), "auto")
-
-
-def _usable(library: str) -> bool:
-    if library == "cholmod":
-        return find_spec("sksparse") is not None
-    if not library.startswith("gpu"):
-        return True
-    from precond_worker.errors import DeviceUnusable
-    from precond_worker.gpu.device import try_out
-
-    try:
-        try_out(library.removeprefix("gpu-"))
-    except DeviceUnusable:
-        return False
-    return True

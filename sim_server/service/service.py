@@ -3,7 +3,8 @@
 
 Threads:
     loop: Engine.run, native, without Python's lock; Driver.advance for policies that wait for factors
-    service: every millisecond or so factors, matrices, commands, and records for log and subscribers
+    service: every millisecond or so, and as soon as a matrix or a factor is there, factors, matrices, commands, and
+        records for log and subscribers
     recorder and link: have threads of their own for the disk and the network
 """
 
@@ -42,6 +43,7 @@ from sim_server.service.pace import LOOK_PERIOD, PaceMonitor
 from sim_server.service.status_requests import StatusRequests
 from sim_server.service.tearing import Tearing
 from sim_server.service.telemetry import Telemetry
+from sim_server.service.wake import Wake
 from sim_server.simulation import Simulation
 from sim_server.state.start import Start
 from sim_server.updates.driver import Driver
@@ -52,7 +54,7 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-ROUND_PERIOD = 1e-3  # s that the service thread sleeps between rounds
+ROUND_PERIOD = 1e-3  # s that the service thread sleeps between rounds, unless it is woken
 HOLD_PERIOD = 1e-4  # the same while the loop is to stand still
 WORKERS_PERIOD = 0.02  # s between checks of local workers
 SILENT_WAIT = 0.5  # s of waiting for first factors before a line tells of it
@@ -80,9 +82,13 @@ class Service:
         self.engine = simulation.engine
         self.engine.loop.realtime, self.engine.loop.patient = int(realtime), int(not realtime)
         self.driver = Driver(simulation, link.dispatch)
+        self._share_device()
         self.commands = Commands(simulation, self._record_interaction, self._frozen)
         self.telemetry = Telemetry(self.driver, link, recorder, not realtime, self.commands)
         self._set_intervals()
+        self._wake = Wake()
+        self.engine.loop.wake, self.driver.wake = self._wake.fd, self._wake.set
+        link.dispatch.wake_by(self._wake.set)
         self._batches: deque[tuple[NDArray[Any], ...]] = deque()  # records and what comes with them
         self._failure: BaseException | None = None
         self._status_requests = StatusRequests(
@@ -109,12 +115,28 @@ class Service:
         self.health = Health(Notifier())
         self.need = NeedMeter(self.driver)
 
+    def _share_device(self) -> None:
+        """Has matrices and factors stay on the device where workers can open its memory, and no step waits for them."""
+        if self.driver.wants_factors and self.driver.policy.free and (memory := self.engine.shared_memory()):
+            memory.sums = self.recorder is not None
+            self.link.share_device(memory)
+
     def _first_factors(self, realtime: bool) -> FirstFactors | None:
         """Returns the first factors that the first step waits for; None: it goes without."""
         driver, wish = self.driver, self.simulation.scene.solver.first_factor
         if not (driver.wants_factors and driver.policy.free and (wish or ("wait" if realtime else "go")) == "wait"):
             return None
         return FirstFactors(driver)
+
+    def ready(self) -> bool:
+        """False while a worker, shared memory or the device is made ready for the first factors. Takes in what workers
+        tell of them."""
+        if not self.driver.wants_factors:
+            return True
+        dispatch = self.link.dispatch
+        self.driver.expect_factors(dispatch)
+        idle = any(worker.idle for worker in dispatch.workers())
+        return idle and not dispatch.makes_slots() and self.engine.expects_factors()
 
     def supervise(self, supervisor: "Supervisor") -> None:
         """Has the local workers of `supervisor` restarted, shown in the status, added and killed by clients."""
@@ -135,10 +157,14 @@ class Service:
         try:
             loop.start()  # inside: a signal may come before it returns, when the thread runs already
             while loop.is_alive() and not self.commands.stopping:
+                begin = time.monotonic()
                 self.round()
-                time.sleep(HOLD_PERIOD if self._between.waits and self._first is None else ROUND_PERIOD)
+                if self._between.waits and self._first is None:
+                    time.sleep(HOLD_PERIOD)
+                else:
+                    self._wake.rest(begin, ROUND_PERIOD)
         finally:
-            self.engine.loop.stop = 1
+            self.engine.loop.stop, self.engine.loop.wake = 1, 0
             while loop.is_alive():  # it may wait for room in its rings
                 self._drain()
                 self._halts.answer()

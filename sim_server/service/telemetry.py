@@ -46,6 +46,7 @@ STATUS_PERIOD = 1.0  # s
 LOOK_PERIOD = 0.02  # s between checks for subscribers
 MAX_BATCH = 4096  # step records sent together at most
 BEHIND = 0.5  # part of the loop's room for records that is full: the log does not follow
+LARGE_NODES = 2000  # of an object whose tip takes more than a millisecond to find
 ENERGY_STEPS = 20  # steps between elastic energies in real time: one costs up to a fifth of a step
 
 
@@ -101,6 +102,11 @@ class Telemetry:
         """
         import scipy.spatial  # noqa: F401  for tips; on a busy machine the first status would wait seconds for it
 
+        world = self.simulation.world
+        self._points = [NamedPoints(world, body) for body in world.bodies]
+        for points in self._points:  # of a large one it takes as long as a dozen answers
+            if len(points.body.mesh.rest) >= LARGE_NODES:
+                _ = points.tip_node
         message = messages.scene(self.simulation)
         message.server = self.link.name
         self.link.set_scene(messages.published(message))
@@ -117,7 +123,7 @@ class Telemetry:
             if resumed is not None:
                 start = pb.Checkpoint(step=self.engine.step, data=resumed.to_bytes())
                 self.recorder.checkpoint(start, self.engine.step * self.simulation.world.dt)
-            world = self.simulation.fetch()
+            self.simulation.fetch()
             self._record_frame(self.engine.step, world.x, world.v)
         self.publish_status("running")
 
@@ -327,12 +333,11 @@ class Telemetry:
         """Begins to fetch the positions of all nodes for the next status; True once they are there."""
         if self._positions is None:
             self._positions = self.simulation.world.backend.begin_fetch(self.simulation.world.x)
+            self._positions.add_done_callback(lambda _: self.driver.wake())
         return self._positions.done()
 
     def _places(self) -> list[NamedPoints]:
         """Returns the named points of all objects at the positions that were fetched, else the present ones."""
-        world = self.simulation.world
-        self._points = self._points or [NamedPoints(world, body) for body in world.bodies]
         self.fetch_places()
         assert self._positions is not None
         x = self._positions.result()

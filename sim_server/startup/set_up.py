@@ -52,10 +52,12 @@ def set_up(closing: ExitStack, o: Options) -> tuple[Service, Supervisor | None]:
         link = closing.enter_context(
             ServerLink(o.name, o.listen, o.connect, shared_memory=o.shared_memory, tls=checked.certificates.server)
         )
-        recorder = None
+        recorder, supervisor = None, None
         if o.record is not None:
             recorder = closing.enter_context(_recorder(o.record, checked.rotation, simulation))
-        service = _service(o, simulation, link, recorder, checked.checkpoint)
+        if o.workers and not simulation.scene.integrator.explicit:  # which needs none
+            supervisor = start_workers(closing, o, link, checked.certificates)  # they take a second to come
+        service = make_service(o, simulation, link, recorder, checked.checkpoint)
         if checked.metrics is not None:
             _serve_metrics(closing, service, *checked.metrics)
     except AddressInUse as error:
@@ -65,9 +67,8 @@ def set_up(closing: ExitStack, o: Options) -> tuple[Service, Supervisor | None]:
     except (BadEndpoint, ConnectionFailed, Refused, CompileError) as error:
         raise InputError(str(error)) from None
     _warn_of_exposure(o)
-    supervisor = None
-    if o.workers and not simulation.scene.integrator.explicit:  # which needs none
-        supervisor = _start_workers(closing, o, service, checked.certificates)
+    if supervisor is not None:
+        service.supervise(supervisor)
     if checked.page is not None:
         _start_page(closing, o, service, checked.certificates, *checked.page)
     return service, supervisor
@@ -106,9 +107,10 @@ def _recorder(record: Path, rotation: Rotation, simulation: Simulation) -> Recor
     return Recorder(path, compression, overwrite=True, report=logging.error, rotation=rotation)
 
 
-def _service(
+def make_service(
     o: Options, simulation: Simulation, link: ServerLink, recorder: Recorder | None, checkpoint: Checkpoint | None
 ) -> Service:  # fmt: skip
+    """Builds the service, from a checkpoint if there is one. Raises InputError."""
     try:
         return Service(simulation, link, recorder, o.steps, o.realtime, checkpoint)
     except InputError as error:
@@ -134,13 +136,13 @@ def _warn_of_exposure(o: Options) -> None:
         )  # fmt: skip
 
 
-def _start_workers(closing: ExitStack, o: Options, service: Service, certificates: Certificates) -> Supervisor:
+def start_workers(closing: ExitStack, o: Options, link: ServerLink, certificates: Certificates) -> Supervisor:
+    """Starts the local workers, which end with `closing`."""
     options = ["--device", o.worker_device, *certificates.for_worker]
-    if not service.link.shared_memory:  # which was told, once
+    if not link.shared_memory:  # which was told, once
         options.append("--no-shared-memory")
     supervisor = Supervisor(o.workers, o.name, [certificates.local_endpoint], options)
     closing.callback(supervisor.close)
-    service.supervise(supervisor)
     return supervisor
 
 

@@ -26,7 +26,8 @@ DERIVED = frozenset({
 TOTALS = frozenset({  # counted or first times of a run, or what factors have to know: no reset takes it back
     "refused", "dropped", "left_before", "changed_at", "at_rest", "copied_at",
 })  # fmt: skip
-ADDED = frozenset({"last_b"})  # since there are checkpoints; those without them go on all the same
+# Since there are checkpoints; those without them go on all the same.
+ADDED = frozenset({"last_b", "differences", "guess"})
 
 
 def state_arrays(simulation: Simulation) -> list[StateArray]:

@@ -71,17 +71,18 @@ class JobState:
     request: number of the request for that copy, among those of all bodies; requested: when it was [s, monotonic]
     extrapolated: by how much the positions requested were extrapolated [s]
     sent: step of the last matrix that was sent; None: none was
+    checked: step of the matrix whose factor has come and is checked beside the steps; NONE: there is none
     matrix: of the job in flight: step and what was sent
     positions: the last job held positions, from which the worker assembles the matrix
-    excess: of the body when the last matrix was sent: to be restored if the job fails
+    excess_sent: of the body when the last matrix was sent: to be restored if the job fails
     """
 
-    in_flight = Cell()
+    in_flight, checked, excess_sent = Cell(), Cell(), Cell()
 
     def __init__(self, table: UpdateTable, index: int):
         self._table, self._index = table, index
         self._copy: NDArray[np.float64] | None = None
-        self.request, self.requested, self.extrapolated, self.excess = 0, 0.0, 0.0, 0.0
+        self.request, self.requested, self.extrapolated = 0, 0.0, 0.0
         self.matrix: tuple[int, NDArray[np.float64]] | None = None
         self.positions = False
 
@@ -92,6 +93,12 @@ class JobState:
     @copy.setter
     def copy(self, copy: NDArray[np.float64] | None) -> None:
         self._copy, self._table.copying[self._index] = copy, copy is not None
+
+    def on_sent(self, step: int) -> None:
+        """Takes note that the copy was sent, but for what stands in the table."""
+        copy, self._copy = self._copy, None
+        self.matrix = None if copy is None else (step, copy)
+        self.positions = copy is not None and copy.ndim == 2
 
     @property
     def sent(self) -> int | None:
@@ -218,18 +225,22 @@ class BodyUpdateState:
 
     def on_sent(self, step: int) -> None:
         """Takes note that the copy of `step` was sent. It is kept until its factor came, which is checked with it."""
-        job, solves = self.job, self.solves
-        job.matrix = None if job.copy is None else (step, job.copy)
-        job.positions = job.copy is not None and job.copy.ndim == 2
-        job.in_flight, job.sent, job.copy = True, step, None
-        job.excess, solves.excess = solves.excess, 0.0
+        self.job.on_sent(step)
+        on_sent(self._table, [self._index], [step])
+
+    def on_check(self, step: int) -> None:
+        """Takes note that the factor of `step` has come and is checked beside the steps: the next matrix may be sent
+        meanwhile."""
+        self.job.checked = step
+        if step == self.job.sent:
+            self.job.in_flight = False
 
     def on_factor(self, factor: Factor, step: int) -> bool:
         """Takes note of a factor that came during `step`; False if a newer one is there already."""
         job = self.job
-        if job.in_flight and factor.step == job.sent:
+        if self._end_check(factor.step) or (job.in_flight and factor.step == job.sent):
             self.factors.latency.add(max(1, step - factor.step))
-        job.in_flight, self.failures.in_a_row = False, 0
+        job.in_flight, self.failures.in_a_row = job.in_flight and (job.sent or 0) > factor.step, 0
         if job.positions:
             self.failures.assemblies = 0
         if factor.step <= self.factors.newest:
@@ -247,18 +258,34 @@ class BodyUpdateState:
     def on_reassignment(self) -> None:
         """Takes note that its job takes too long; it may be sent to another worker."""
         self.job.in_flight = False
-        self.solves.excess += self.job.excess
+        self.solves.excess += self.job.excess_sent
 
-    def on_failure(self, reason: str, refused: bool = False) -> None:
-        """Takes note that its job failed; it may be sent again. refused: it brought a factor that is not used."""
-        self.on_reassignment()
+    def on_failure(self, reason: str, refused: bool = False, step: int | None = None) -> bool:
+        """Takes note that a job failed; it may be sent again. Returns False if a newer one has been sent since.
+
+        refused: it brought a factor that is not used
+        step: of its matrix; None: of the one sent last
+        """
+        last = step is None or step == self.job.sent
+        if step is not None:
+            self._end_check(step)
+        if last:
+            self.on_reassignment()
         failures = self.failures
         failures.reason = reason
         failures.refused += 1
         failures.in_a_row += 1
         failures.assemblies += self.job.positions
-        if self.tuner is not None:
+        if last and self.tuner is not None:
             self.tuner.factorization.on_failure(refused)
+        return last
+
+    def _end_check(self, step: int) -> bool:
+        """True if the factor of a step was checked beside the steps, which is over now."""
+        was = bool(self.job.checked == step)
+        if was:
+            self.job.checked = NONE
+        return was
 
     def observe(self, record: Any, floor: int, cost: float) -> None:
         """Takes note of a solve (a record of the loop).
@@ -287,9 +314,12 @@ def excess(records: Any, floor: int, error_bound: Any) -> Any:
     its error over the bound [m], since it has no iterations, and a factor that ages costs accuracy instead.
     records: of the loop, of any shape that error_bound is broadcast to
     """
-    stages = np.where(records["form"] == ONE_SOLVE, 1, STAGES)
-    above = np.maximum(records["iterations"] - floor * stages * np.maximum(records["linearizations"], 1), 0)
-    alone = records["form"] == FACTOR
+    form = records["form"]
+    stages = np.where(form == ONE_SOLVE, 1, STAGES)
+    above = np.maximum(records["iterations"] - floor * stages * np.maximum(records["linearizations"], 1), 0.0)
+    alone = form == FACTOR
+    if not alone.any():  # of a thousand bodies each operation counts
+        return above
     return np.where(alone, np.where(alone, records["estimate"], 0.0) / error_bound, above)
 
 
@@ -302,7 +332,7 @@ def observe_steps(table: UpdateTable, r: NDArray[Any], floor: int) -> None:
     above = excess(r, floor, table.error_bound)
     weights = (1 - MEMORY) ** np.arange(steps - 1, -1, -1)
     each = r["solve"] / (r["iterations"] + 1)
-    costs = weights @ each / weights.sum()
+    costs = each[0] if steps == 1 else weights @ each / weights.sum()
     before = np.where(np.isnan(table.iteration_cost), each[0], table.iteration_cost)
     table.iteration_cost[:] = costs + (1 - MEMORY) ** steps * (before - costs)
     table.refused += r["fallbacks"].sum(axis=0)
@@ -334,6 +364,13 @@ def _add_changed(table: UpdateTable, row: NDArray[np.int64], above: Any, factor:
     table.excess[row], table.latest[row], table.lost[row], table.factor_step[row] = total, latest, lost, last
 
 
+def on_sent(table: UpdateTable, rows: Sequence[int], steps: Sequence[int]) -> None:
+    """Takes note of copies that were sent, of some steps, in what the table has of them."""
+    row = np.asarray(rows, np.int64)
+    table.in_flight[row], table.copying[row], table.sent[row] = True, False, steps
+    table.excess_sent[row], table.excess[row] = table.excess[row], 0.0
+
+
 def on_factors(
     states: Sequence[BodyUpdateState], table: UpdateTable, factors: Sequence[Factor], step: int
 ) -> list[bool]:  # fmt: skip
@@ -343,9 +380,12 @@ def on_factors(
     """
     row = np.array([state.body.index for state in states])
     made = np.array([factor.step for factor in factors])
-    came = table.in_flight[row] & (made == table.sent[row])
+    checked = made == table.checked[row]
+    came = checked | (table.in_flight[row] & (made == table.sent[row]))
     _add(table.latency, row[came], np.maximum(1, step - made[came]))
-    table.in_flight[row], table.failures[row] = False, 0
+    table.checked[row[checked]] = NONE
+    table.in_flight[row] &= table.sent[row] > made
+    table.failures[row] = 0
     newer = made > table.newest[row]
     taken = row[newer]
     _add(table.cost, taken, np.maximum([factor.seconds for factor in factors], MIN_SECONDS)[newer])

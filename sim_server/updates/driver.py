@@ -68,6 +68,7 @@ class Driver:
     def __init__(self, simulation: Simulation, source: FactorSource | None = None, counted: bool | None = None):
         self.simulation, self.engine = simulation, simulation.engine
         self.solver = simulation.scene.solver
+        self._method, self._dtype = self.solver.method, self.solver.factor_dtype  # of each of thousands of jobs
         world, self._patterns = simulation.world, Patterns.of(simulation)
         alone = simulation.scene.uses_factor_alone  # in place of A: it must be exact, so nothing is to choose from
         self.inline, self.check = Inline(self._patterns), FactorCheck(self._patterns, alone)
@@ -85,14 +86,18 @@ class Driver:
             self.check.prepare()
             self.engine.prepare_for_factors()
             self.source.use_memory(self.engine.factor_memory)
+            if self.policy.free:
+                self.engine.prepare_copies()
         self.reactions: Float64 = np.zeros((0, 0, 6))
         self.other_reactions: NDArray[Any] = np.zeros(0, REACTION)
         self.readings: Float64 = np.zeros((0, 0))
+        self.wake: Callable[[], None] = lambda: None  # called in another thread when `pump` has something to take up
         self.on_adopt: list[Callable[[Factor], Any]] = []  # called with every factor that the loop is given
         self.on_epoch: list[Callable[[Body, int], None]] = []  # called before the first job of an epoch of a body
         self.snapshots = SnapshotPool(simulation, self.source, self.policy.expected_latency)
         self.useless_factors = UselessFactors(self)
         self.checks: list[FactorsUnderCheck] = []  # oldest first
+        self._behind: list[Factor] = []  # that wait for the end of the check of the factor before them
         self._begin_checks()
         self._observer = SolveObserver(self)
         self._warped = {b.name: b.index in simulation.warped for b in world.bodies}
@@ -153,26 +158,38 @@ class Driver:
 
     # --- matrices out -------------------------------------------------------------------------------------------
 
-    def requests(self) -> UpdateRequests:
-        """Returns what the scheduler is told of each body but those that are frozen."""
+    def requests(self, ahead: bool = False) -> UpdateRequests:
+        """Returns what the scheduler is told of each body but those that are frozen.
+
+        ahead: only of those whose last factor is checked beside the steps, which count as in flight otherwise: of those
+            whose next matrix may go ahead of it, one alone: there are two places for copies. It does where factors
+            have been of use and `auto` compares none
+        """
         t, step = self.table, self.engine.step
         tuners = [state.tuner for state in self.bodies] if self._tuned else []
         on_trial = np.array([t is not None and t.wants_factor for t in tuners] or [False] * len(self.bodies))
         age = np.where((t.newest >= 0) & ~t.dropped, step - t.newest, NONE)
         iteration_cost, cost = (np.where(np.isnan(each), 1.0, each) for each in (t.iteration_cost, t.cost))
         waited = np.where(t.sent >= 0, step - t.sent, NONE)
+        checked = t.checked != NONE
+        on_its_way = t.in_flight | t.copying | (False if ahead else checked)
         every = UpdateRequests(
-            np.arange(len(t)), t.excess, waited, t.in_flight | t.copying, age, iteration_cost, cost, t.failures,
-            t.lost, on_trial, t.latest,
+            np.arange(len(t)), t.excess, waited, on_its_way, age, iteration_cost, cost, t.failures, t.lost, on_trial,
+            t.latest,
         )  # fmt: skip
-        return every.of(~t.frozen)
+        if not ahead:
+            return every.of(~t.frozen)
+        compared = np.array([t is not None and t.factorization.candidate is not None for t in tuners] or False)
+        last = checked & (t.sent == t.checked)
+        return every.of(last & ~t.frozen & (age >= 0) & (t.failures == 0) & ~compared)
 
     def make_job(self, state: BodyUpdateState) -> Job | None:
         """Returns the job of the copy that the loop has made for a body. None: the copy does not suffice and is
         discarded."""
         assert state.job.copy is not None
         if self.snapshots.suffices(state) and self._is_present(state):
-            return self._job(state, self.snapshots.step(state), state.job.copy)
+            step = self.snapshots.step(state)
+            return self._job(state, step, state.job.copy, self.engine.staged_matrix(state.body.index))
         self.snapshots.discard(state)
         return None
 
@@ -191,16 +208,17 @@ class Driver:
         state.job.matrix = step, values
         return self._job(state, step, values)
 
-    def _job(self, state: BodyUpdateState, step: int, values: NDArray[np.float64]) -> Job:
+    def _job(self, state: BodyUpdateState, step: int, values: NDArray[np.float64], on_device: int = 0) -> Job:
         name, epoch = state.body.name, self.simulation.epoch(state.body.name, step)
-        if self.simulation.splits is not None and values.ndim == 3:  # the copy has room for more blocks
-            values = values[: len(self._patterns.at(name, epoch)[1])]
-        if self.source.epoch(name) not in (None, epoch):
-            for begin in self.on_epoch:
-                begin(state.body, epoch)
-        method = self.solver.method if state.tuner is None else state.tuner.factorization.method
+        if self.simulation.splits is not None:
+            if values.ndim == 3:  # the copy has room for more blocks
+                values = values[: len(self._patterns.at(name, epoch)[1])]
+            if self.source.epoch(name) not in (None, epoch):
+                for begin in self.on_epoch:
+                    begin(state.body, epoch)
+        method = self._method if state.tuner is None else state.tuner.factorization.method
         state.on_job(step, method)
-        return Job(name, epoch, step, self._warped[name], values, self.solver.factor_dtype, method)
+        return Job(name, epoch, step, self._warped[name], values, self._dtype, method, on_device)
 
     # --- factors in ---------------------------------------------------------------------------------------------
 
@@ -208,12 +226,17 @@ class Driver:
         """Passes on the factors that a source has made since the last call, and takes note of failed jobs and of
         patterns that factors will have."""
         self._end_checks()
-        for name, pattern in source.patterns():
-            self.engine.expect_factors(self.by_name[name].body.index, pattern)
-        if factors := source.poll():
+        self.expect_factors(source)
+        behind, self._behind = self._behind, []
+        if factors := [*behind, *source.poll()]:
             on_factors(factors)
         for name, reason in source.failures():
             self.fail(name, reason)
+
+    def expect_factors(self, source: FactorSource) -> None:
+        """Has the loop prepare for the factors whose patterns have come."""
+        for name, pattern in source.patterns():
+            self.engine.expect_factors(self.by_name[name].body.index, pattern)
 
     def adopt(self, factors: Sequence[Factor], now: bool = False) -> None:
         """Puts factors into the mailboxes of their bodies, unless a newer one is there or the check refuses it.
@@ -225,7 +248,9 @@ class Driver:
         together: list[Factor] = []
         for factor in factors:
             state = self.by_name[factor.object]
-            if factor.step <= state.factors.newest or state.frozen:
+            if beside and not self._may_check(state, factor):
+                self._behind.append(factor)  # its job counts as in flight, so that none comes behind it
+            elif factor.step <= state.factors.newest or state.frozen:
                 self.snapshots.release(state, factor.step)
                 self._take_up([factor], [""])
             elif beside and factor.worker != Inline.WORKER and factor.values.nbytes > LARGE:
@@ -239,11 +264,20 @@ class Driver:
             self._take_up(together, self.check.reject_reasons(at_once))
         self.policy.on_job_end()
 
+    def _may_check(self, state: BodyUpdateState, factor: Factor) -> bool:
+        """False while a factor of the body is checked, or a large one could not be made ready at once: the checks of
+        others would wait for it."""
+        large = factor.values.nbytes > LARGE
+        return state.job.checked == NONE and (not large or self.engine.may_prepare(state.body.index))
+
     def _check_beside(self, factors: Sequence[Factor]) -> None:
         held = [self.snapshots.hold(self.by_name[f.object], f.step) for f in factors]
         checked = [(factor, matrix) for factor, (_, matrix) in zip(factors, held, strict=True)]
+        for factor in factors:
+            self.by_name[factor.object].on_check(factor.step)
         applied = self._prepare(factors[0]) if len(factors) == 1 else None
         reasons = self._checker.submit(self.check.reject_reasons, checked, applied)
+        reasons.add_done_callback(lambda _: self.wake())
         self.checks.append(FactorsUnderCheck(factors, [memory for memory, _ in held], reasons))
 
     def _prepare(self, factor: Factor) -> Callable[[], Float64 | None] | None:
@@ -262,7 +296,7 @@ class Driver:
             self._begin_checks()
             lost, self.checks = self.checks, []
             for factor in [factor for check in lost for factor in check.factors]:
-                self.fail(factor.object, "its check ended with the process that it was in")
+                self.fail(factor.object, "its check ended with the process that it was in", step=factor.step)
         ended = [each for each in self.checks if each.reasons.done()]
         for check in ended:
             self.checks.remove(check)
@@ -273,7 +307,7 @@ class Driver:
             for factor, reason in zip(check.factors, check.reasons.result(), strict=True):
                 if self.source.epoch(factor.object) not in (None, factor.epoch):
                     self.engine.drop_factor(self.by_name[factor.object].body.index, factor)
-                    self.fail(factor.object, "it was of a mesh that was split since")
+                    self.fail(factor.object, "it was of a mesh that was split since", step=factor.step)
                     continue
                 good.append(factor)
                 reasons.append(reason)
@@ -286,7 +320,7 @@ class Driver:
         for factor, why in zip(factors, reasons, strict=True):
             if why:
                 self.useless_factors.on_rejected(factor)
-                self.fail(factor.object, f"that of {factor.worker} is not used: {why}", refused=True)
+                self.fail(factor.object, f"that of {factor.worker} is not used: {why}", refused=True, step=factor.step)
             else:
                 good.append(factor)
         newer = self._on_factors(good)  # others are older than the newest
@@ -337,11 +371,14 @@ class Driver:
         self.engine.resume_factor(state.body.index, factor.pattern, factor.values, factor.step)
         self.engine.settle_factors()
 
-    def fail(self, name: str, reason: str, refused: bool = False) -> None:
-        """Takes note of a job without a factor, or with one that is refused; the object may be sent again."""
+    def fail(self, name: str, reason: str, refused: bool = False, step: int | None = None) -> None:
+        """Takes note of a job without a factor, or with one that is refused; the object may be sent again.
+
+        step: of its matrix; None: of the one sent last
+        """
         state = self.by_name[name]
-        self.snapshots.release(state)
-        state.on_failure(reason, refused)
+        if state.on_failure(reason, refused, step):
+            self.snapshots.release(state)
         self.policy.on_job_end()
         self.report(state, reason)
 

@@ -10,7 +10,7 @@ import ctypes as c
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from functools import cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,11 +19,13 @@ from protocol.factor import Factor, FactorPattern
 from sim_server.arrays import Int32
 from sim_server.backends.compiler import native
 from sim_server.backends.cpu import structs
-from sim_server.backends.cpu.engine import NativePattern
+from sim_server.backends.cpu.factors import NativePattern
 from sim_server.updates.patterns import Patterns
 
 Reals = NDArray[np.float64]
 MAX_RESIDUAL = 0.05  # |r - A P^-1 r| / |r| of a factor that is to take the place of A; exact ones in float32 have 1e-3
+WITH_FACTOR, WITH_BLOCK_JACOBI = 1, 2  # parts of a judgement (factor_check.cpp)
+NO_VALUES = np.zeros(1, np.float32)
 WORK = 8  # numbers for each degree of freedom
 MIN_SHARE = 0.9  # of what block Jacobi takes off, for a factor to be used; not 1, as one vector is not the space
 
@@ -46,7 +48,7 @@ class Probe(NamedTuple):
 @cache
 def _library() -> c.CDLL:
     p = c.c_void_p
-    arguments = [c.c_int32, c.POINTER(structs.Factor), p, p, p, p, p, p, p, p]
+    arguments = [c.c_int32, c.c_int32, c.POINTER(structs.Factor), p, p, p, p, p, p, p, p]
     library = native("backends/cpu/native/factor_check.cpp", {"wf_judge_all": (None, arguments)}, stepping=False)
     structs.LOOP.check_sizes(library)
     return library
@@ -59,6 +61,7 @@ class CheckedBody:
         self.row_start, self.columns, self.probe = row_start, columns, probe
         self.factor_pattern = NativePattern(pattern)
         self.addresses = tuple(each.ctypes.data for each in (row_start, columns, probe))
+        self.native = c.addressof(self.factor_pattern.native)
 
     def fits(self, row_start: Int32, columns: Int32, pattern: FactorPattern) -> bool:
         """True if the arrays are still those."""
@@ -94,7 +97,7 @@ class FactorCheck:
         self, checked: Sequence[tuple[Factor, Reals | None]], applied: Callable[[], Reals | None] | None = None
     ) -> list[str]:  # fmt: skip
         """Returns why each of some factors is not to be used; empty if it is. From any thread: native code is called
-        once, without Python's lock.
+        without Python's lock, once, or twice if somebody applies the factor.
 
         checked: factors, each with the values (blocks, 3, 3) that it was made from; None: not known, and the test
             against block Jacobi is left out
@@ -102,8 +105,7 @@ class FactorCheck:
         """
         reasons = [self.wrong_size(factor) for factor, _ in checked]
         fitting = [each for each, reason in zip(checked, reasons, strict=True) if not reason]
-        z = applied() if applied is not None else None
-        probes = iter(self.probe_all(fitting, z))
+        probes = iter(self.probe_all(fitting, applied))
         return [reason or self._useless(*each, next(probes)) for each, reason in zip(checked, reasons, strict=True)]
 
     def wrong_size(self, factor: Factor) -> str:
@@ -134,37 +136,49 @@ class FactorCheck:
         """Applies a factor, which has the right size, to the probe vector r. From any thread."""
         return self.probe_all([(factor, matrix)])[0]
 
-    def probe_all(self, checked: Sequence[tuple[Factor, Reals | None]], applied: Reals | None = None) -> list[Probe]:
-        """Applies factors, each of which has the right size, to the probe vector r. From any thread. applied: P^-1 r of
-        the only one, which has been applied already."""
+    def probe_all(
+        self, checked: Sequence[tuple[Factor, Reals | None]], applied: Callable[[], Reals | None] | None = None
+    ) -> list[Probe]:  # fmt: skip
+        """Applies factors, each of which has the right size, to the probe vector r. From any thread. applied: as of
+        `reject_reasons`"""
         if not checked:
             return []
-        with self._lock:
-            return self._probe_all(checked, applied)
-
-    def _probe_all(self, checked: Sequence[tuple[Factor, Reals | None]], applied: Reals | None) -> list[Probe]:
-        count = len(checked)
-        factors, kept = (structs.Factor * count)(), []  # what is kept must live until the native code is done
-        nodes, pointers = np.zeros(count, np.int32), np.zeros((5, count), np.uintp)
-        for i, (factor, matrix) in enumerate(checked):
-            body, values = self._body(factor), np.ascontiguousarray(factor.values)
-            factors[i].pattern, factors[i].values = c.addressof(body.factor_pattern.native), values.ctypes.data
-            factors[i].step, factors[i].bytes = factor.step, values.itemsize
-            nodes[i] = len(body.row_start) - 1
-            pointers[:4, i] = *body.addresses, 0 if matrix is None else matrix.ctypes.data
-            pointers[4, i] = 0 if applied is None else applied.ctypes.data
-            kept.append((body, values))
-        if (needed := WORK * 3 * int(nodes.max())) > len(self._work):
-            self._work = np.empty(needed)
-        out = np.zeros((count, 5))
-        row_start, columns, r, matrices, z = (each.ctypes.data for each in pointers)
-        _library().wf_judge_all(
-            count, factors, nodes.ctypes.data, row_start, columns, matrices, r, z, self._work.ctypes.data,
-            out.ctypes.data,
-        )  # fmt: skip
+        out = np.zeros((len(checked), 5))
+        if applied is None:
+            self._judge(checked, WITH_FACTOR | WITH_BLOCK_JACOBI, None, out)
+        else:  # block Jacobi meanwhile
+            self._judge(checked, WITH_BLOCK_JACOBI, None, out)
+            self._judge(checked, WITH_FACTOR, applied(), out)
         za = np.where(out[:, [1, 3]] > 0, out[:, [1, 3]], np.inf)
         energy = out[:, [0, 2]] ** 2 / za
         return [Probe(*row) for row in np.column_stack([out[:, 0], energy, out[:, 4]]).tolist()]
+
+    def _judge(
+        self, checked: Sequence[tuple[Factor, Reals | None]], parts: int, applied: Reals | None, out: Reals
+    ) -> None:  # fmt: skip
+        """Fills in parts of `out` (k, 5). applied: P^-1 r of the only factor, whose values are not read then"""
+        with self._lock:
+            self._judge_locked(checked, parts, applied, out)
+
+    def _judge_locked(
+        self, checked: Sequence[tuple[Factor, Reals | None]], parts: int, applied: Reals | None, out: Reals
+    ) -> None:  # fmt: skip
+        bodies = [self._body(factor) for factor, _ in checked]
+        read = bool(parts & WITH_FACTOR) and applied is None  # those on a device would be copied
+        values = [np.ascontiguousarray(factor.values if read else NO_VALUES) for factor, _ in checked]
+        factors = np.zeros(len(checked), np.dtype(structs.Factor))
+        factors["pattern"], factors["values"] = [body.native for body in bodies], [_address(each) for each in values]
+        factors["step"], factors["bytes"] = [f.step for f, _ in checked], [each.itemsize for each in values]
+        nodes = np.array([len(body.row_start) - 1 for body in bodies], np.int32)
+        if (needed := WORK * 3 * int(nodes.max())) > len(self._work):
+            self._work = np.empty(needed)
+        row_start, columns, r = np.array([body.addresses for body in bodies], np.uintp).T.copy()
+        matrices = np.array([0 if matrix is None else _address(matrix) for _, matrix in checked], np.uintp)
+        z = np.full(len(checked), 0 if applied is None else _address(applied), np.uintp)
+        _library().wf_judge_all(
+            len(checked), parts, factors.ctypes.data_as(c.POINTER(structs.Factor)),
+            *(each.ctypes.data for each in (nodes, row_start, columns, matrices, r, z, self._work, out)),
+        )  # fmt: skip
 
     def _body(self, factor: Factor) -> CheckedBody:
         row_start, columns = self._patterns.at(factor.object, factor.epoch)
@@ -178,3 +192,8 @@ class FactorCheck:
         if size not in self._vectors:
             self._vectors[size] = np.random.default_rng(0).standard_normal(size)
         return self._vectors[size]
+
+
+def _address(array: NDArray[Any]) -> int:
+    address: int = array.__array_interface__["data"][0]
+    return address

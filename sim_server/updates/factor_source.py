@@ -31,6 +31,7 @@ class Job:
         it; read during `submit`, or until the job is over
     warp: the matrix is in the material frame
     dtype, method: of the factor to be made
+    on_device: address of the same values in memory of the device of the simulation; 0: there is none
     """
 
     object: str
@@ -40,6 +41,7 @@ class Job:
     values: Float64
     dtype: str = "float32"
     method: Method = EXACT
+    on_device: int = 0
 
     @property
     def positions(self) -> bool:

@@ -8,13 +8,16 @@ own matrix.
 
 import time
 from collections.abc import Callable
+from dataclasses import replace
 
 from sim_server.updates.body_state import BodyUpdateState
 from sim_server.updates.driver import Driver
+from sim_server.updates.factor_source import Job
 
 TIMEOUT = 60.0  # s until the first step goes on without factors
 WORKER_TIMEOUT = 3.0  # s without any worker, likewise
 MAX_FAILURES = 2  # jobs of a body that bring no factor, after which it is not waited for
+SMALL = 4 << 20  # bytes of a matrix that may travel with others
 NAMED = 3  # objects named in a line
 
 
@@ -89,7 +92,7 @@ class FirstFactors:
                 del self._failures[name]
         unsent = [state for name, state in self._waiting.items() if name not in self._failures]
         chosen = sorted(unsent, key=lambda state: state.body.first - state.body.last)[: source.ready()]
-        sent = source.submit_many([driver.assembled_job(state) for state in chosen])
+        sent = source.submit_many([_lasting(driver.assembled_job(state)) for state in chosen])
         for state, taken in zip(chosen, sent, strict=True):
             if taken:
                 self._failures[state.body.name] = state.failures.in_a_row
@@ -102,6 +105,12 @@ class FirstFactors:
             step, values = state.job.matrix
             state.job.matrix = step, values.copy()[:]  # the next step assembles anew; a view is not recycled
             state.job.in_flight, state.job.sent = True, step
+
+
+def _lasting(job: Job) -> Job:
+    """Returns the job with a copy of its values if it may share a message: they are read when that leaves, which may be
+    after this step has gone on without its factor, and the next step makes them anew."""
+    return replace(job, values=job.values.copy()) if job.values.nbytes <= SMALL else job
 
 
 def few(missing: list[str]) -> str:

@@ -62,6 +62,8 @@ class UpdateRequests:
 
     def of(self, chosen: Any) -> "UpdateRequests":
         """Returns the requests that an index or a mask chooses."""
+        if isinstance(chosen, np.ndarray) and chosen.dtype == np.bool_ and chosen.all():
+            return self
         return UpdateRequests(*(getattr(self, field.name)[chosen] for field in fields(self)))
 
 
@@ -112,25 +114,27 @@ def pick(
     return chosen
 
 
-def round_duration(latencies: ArrayLike, workers: int) -> float:
-    """Returns the steps in which `workers` serve every body once; inf without workers.
+def round_duration(latencies: ArrayLike, jobs: float) -> float:
+    """Returns the steps in which every body is served once; inf without workers.
 
     latencies: steps from matrix to factor of each body
+    jobs: that are on their way at a time, one at each worker at least; 0: there is no worker. Each ends after its
+        latency, so that jobs / latency of them end in a step (Little 1961, A proof for the queuing formula L = λ W)
     """
-    return float(np.sum(latencies)) / workers if workers > 0 else inf
+    return float(np.sum(latencies)) / jobs if jobs > 0 else inf
 
 
-def overdue_after(rounds: float, latencies: ArrayLike, workers: int) -> float:
+def overdue_after(rounds: float, latencies: ArrayLike, jobs: float) -> float:
     """Returns the steps after which a body goes next whatever the rule: `rounds` rounds, inf without workers."""
-    return rounds * round_duration(latencies, workers)
+    return rounds * round_duration(latencies, jobs)
 
 
-def max_factor_age(overdue: float, latencies: ArrayLike, workers: int) -> int:
+def max_factor_age(overdue: float, latencies: ArrayLike, jobs: float) -> int:
     """Returns a bound on the age of any factor in steps, -1 without workers.
 
     A body waits until it is overdue and then behind all the others, and its matrix is copied, factorized and taken
     up while the factor before is still in use.
     """
-    if workers < 1 or not np.size(latencies):
+    if jobs <= 0 or not np.size(latencies):
         return -1
-    return ceil(overdue + round_duration(latencies, workers) + 2 * float(np.max(latencies)) + 2)
+    return ceil(overdue + round_duration(latencies, jobs) + 2 * float(np.max(latencies)) + 2)

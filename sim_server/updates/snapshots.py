@@ -46,7 +46,9 @@ class SnapshotPool:
             engine.request_positions(body.index, job.copy, job.extrapolated)
         else:
             job.extrapolated = 0.0
-            job.copy = self._allocate((self._simulation.system.most_blocks(body.first, body.last), 3, 3))
+            shape = self._simulation.system.most_blocks(body.first, body.last), 3, 3
+            own = engine.copy_memory(body.index)
+            job.copy = own if own is not None and own.shape == shape else self._allocate(shape)
             engine.request_matrix(body.index, job.copy)
 
     def step(self, state: BodyUpdateState) -> int:
@@ -54,10 +56,12 @@ class SnapshotPool:
         step: int = self._simulation.engine.matrix_step(state.body.index)
         return step
 
-    def completed(self) -> list[BodyUpdateState]:
-        """Returns the bodies whose copy is there, in the order of the requests."""
+    def completed(self) -> list[tuple[BodyUpdateState, int]]:
+        """Returns the bodies whose copy is there, in the order of the requests, and the steps of these copies."""
         self._requested = {k: state for k, state in self._requested.items() if state.job.copy is not None}
-        return sorted((s for s in self._requested.values() if self.step(s) >= 0), key=lambda s: s.job.request)
+        steps = self._simulation.engine.matrix_steps(list(self._requested)).tolist()
+        there = [(s, step) for s, step in zip(self._requested.values(), steps, strict=True) if step >= 0]
+        return sorted(there, key=lambda each: each[0].job.request)
 
     def suffices(self, state: BodyUpdateState) -> bool:
         """True if the copy is all that a worker needs. Positions do not tell of the springs of a grab, nor of other

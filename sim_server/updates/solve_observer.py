@@ -35,7 +35,7 @@ class SolveObserver:
         """Sums up records of the loop, in their order."""
         states = self._driver.bodies
         if self._driver.simulation.energies.freezes:
-            for body in np.unique(records["body"][records["status"] == RUNAWAY]):
+            for body in set(records["body"][records["status"] == RUNAWAY].tolist()):
                 states[body].frozen = True
         whole_steps = len(records) >= max(len(states), MIN_TOGETHER) and len(records) % len(states) == 0
         if whole_steps and not self._driver.counted:

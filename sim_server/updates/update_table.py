@@ -19,7 +19,7 @@ class UpdateTable:
     excess, latest, lost, factor_step, max_factor_age, iteration_cost, first_excess: as in SolveStatistics
     refused, failures: as `refused`, `in_a_row` in FailureState
     newest, latency, cost, used: as in FactorStatistics; dropped: the newest factor is useless
-    sent, in_flight: as in JobState; copying: a copy is requested, or waits to be sent
+    sent, in_flight, checked, excess_sent: as in JobState; copying: a copy is requested, or waits to be sent
     frozen, error_bound: as in BodyUpdateState
     """
 
@@ -33,8 +33,9 @@ class UpdateTable:
         def steps() -> Int64:
             return np.full(bodies, NONE, np.int64)
 
-        self.excess, self.latest, self.lost = zeros(), zeros(), zeros()
+        self.excess, self.latest, self.lost, self.excess_sent = zeros(), zeros(), zeros(), zeros()
         self.factor_step, self.max_factor_age, self.newest, self.sent = steps(), steps(), steps(), steps()
+        self.checked = steps()
         self.iteration_cost, self.latency, self.cost = unknown(), unknown(), unknown()
         self.first_excess = unknown()
         self.refused, self.failures, self.used = (np.zeros(bodies, np.int64) for _ in range(3))

@@ -153,7 +153,7 @@ def compiled(folder: Path, text: str, *defined: str) -> c.CDLL:
     headers = {"block_group.cuh": group, "pcg.cu": solver, "partitioned_inverse.cuh": INVERSE, "clock.cuh": CLOCK}
     for name, written in headers.items():
         (folder / name).write_text(written)
-    for name in ("spmv.cuh", "correction.cuh", "pool_order.cuh", "contact.cu"):  # beside the other headers
+    for name in ("spmv.cuh", "correction.cuh", "pool_order.cuh", "contact.cu", "smoothed.cu"):  # beside other headers
         (folder / name).write_text((gpu / name).read_text())
     header, found = re.subn(r"CONTACT_THREADS = \d+", f"CONTACT_THREADS = {THREADS}",
                             (gpu / "device_contact.cuh").read_text())  # fmt: skip
@@ -173,7 +173,8 @@ class SolverHost(Host):
     def __init__(self) -> None:
         super().__init__()
         self.cp.ones = lambda shape, dtype=float: as_device(np.ones(shape, dtype))
-        self.cp.cuda = SimpleNamespace(Device=lambda: SimpleNamespace(use=lambda: None))
+        device = SimpleNamespace(use=lambda: None)
+        self.cp.cuda = SimpleNamespace(Device=lambda: device, Stream=lambda **_: None)
         self.properties = {"multiProcessorCount": 132, "sharedMemPerMultiprocessor": 1 << 17}
 
 
@@ -263,7 +264,7 @@ class Solver:
         self.gpu.renew()
         c.memmove(self.solver.bodies_device, self.solver.bodies.ctypes.data, self.solver.bodies.nbytes)
 
-    def _run(self, library: c.CDLL) -> None:
+    def launched(self, library: c.CDLL) -> None:
         library.solve(*(c.c_void_p(x.ctypes.data) for x in (self.solver.params, self.correction.params)))
 
     def solve(self, library: c.CDLL) -> tuple[np.void, np.void]:
@@ -271,7 +272,7 @@ class Solver:
         self.sim.engine.assemble()
         self.matrix = self.sim.engine.factor_matrix(0).copy()
         self.renew()
-        self._run(library)
+        self.launched(library)
         self.sim.engine.solve()
         ours, theirs = self.gpu.twin(self.arrays["y"]), self.arrays["y"]
         self.error = float(np.abs(ours - theirs).max() / np.abs(theirs).max())
@@ -299,7 +300,7 @@ class ContactSolver(Solver):
         )  # fmt: skip
         self.solver.params["b"] = self.passes.memory["contact_b"].data.ptr
 
-    def _run(self, library: c.CDLL) -> None:
+    def launched(self, library: c.CDLL) -> None:
         passes = self.passes
         given = (passes.params, passes.first, passes.later, self.solver.params, self.correction.params)
         assert library.step(*(c.c_void_p(x.ctypes.data) for x in given), passes.grid) < 200

@@ -11,8 +11,10 @@ import numpy as np
 import pytest
 
 from protocol.factor import Factor
+from sim_server.backends.cpu import structs
 from sim_server.backends.cpu.device import module
 from sim_server.backends.cpu.engine import CpuEngine
+from sim_server.backends.cpu.library import loop_library
 from sim_server.backends.cpu.structs import RECORD
 from sim_server.backends.kinds import Kind
 from sim_server.simulation import Simulation
@@ -173,8 +175,8 @@ def test_a_factor_just_taken_out_of_the_mailbox_is_not_overwritten():
     sim.engine.post_factor(0, pattern, values, 1)
     sim.engine.run(1)
     sim.engine.post_factor(0, pattern, values * 2, 2)
-    body = sim.engine._body[0]
-    taken = sim.engine._native.wf_post_factor(ctypes.byref(body), None)  # as the loop does it
+    body = ctypes.cast(sim.engine.loop.body, ctypes.POINTER(structs.Body))[0]
+    taken = loop_library().wf_post_factor(ctypes.byref(body), None)  # as the loop does it
     sim.engine.post_factor(0, pattern, values * 3, 3)
     buffer = next(b for b in sim.engine.factor_buffers(0) if b.address == taken)
     assert buffer.native.step == 2
@@ -299,7 +301,7 @@ def test_a_ring_holds_whole_steps(bodies):
 def test_settings_made_within_a_step_hold_from_the_next_one():
     """A step is solved with what it began with, and its record says so: in real time most are written within a step."""
     sim = falling(preconditioner="block_jacobi", integrator={"linearizations": 3, "tolerance": 1e-12})
-    settings, first = sim.engine.settings(0), sim.engine._launch[0]
+    settings, first = sim.engine.settings(0), ctypes.cast(sim.engine.loop.launch, ctypes.POINTER(structs.Launch))[0]
     kernel = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_int, ctypes.c_int)
     original = kernel(first.kernel)
 

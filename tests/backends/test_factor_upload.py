@@ -56,8 +56,8 @@ class Maker:
         self.planned: Future = Future()
         self.planned.set_result(SimpleNamespace(builder=self, plan=None))
 
-    def planes_for(self, pattern: SimpleNamespace, values: np.ndarray) -> int:
-        return 2 if values[0] in self.fine else 1
+    def planes_of(self, factors: list[tuple[SimpleNamespace, np.ndarray]]) -> list[int]:
+        return [2 if values[0] in self.fine else 1 for _, values in factors]
 
     def begin_plan(self, body: int, pattern: SimpleNamespace, planes: int | None = None) -> Future:
         if self.planning is None and not isinstance(self.fail, ValueError):
@@ -75,6 +75,9 @@ class Maker:
     def storage(self) -> list[int]:
         self.storages.append([])
         return self.storages[-1]
+
+    def several_storages(self, number: int) -> list[list[int]]:
+        return [self.storage() for _ in range(number)]
 
     spared, planes = 8, None
     most = 3  # inverses that are built together
@@ -444,7 +447,7 @@ def test_a_large_factor_is_looked_at_and_built_beside_the_caller(parts, monkeypa
     scene, maker, upload = parts
     monkeypatch.setattr(module, "SMALL", 0)
     maker.fine, threads = {5}, []
-    choose = maker.planes_for
+    choose = maker.planes_of
 
     def seen(*arguments: Any) -> int:
         threads.append(threading.current_thread())
@@ -453,7 +456,7 @@ def test_a_large_factor_is_looked_at_and_built_beside_the_caller(parts, monkeypa
     def queued(body: int, pattern: SimpleNamespace, planes: int) -> Future:
         return maker.thread.submit(lambda: SimpleNamespace(builder=maker, plan=None))
 
-    maker.planes_for = seen
+    maker.planes_of = seen
     if waits:
         maker.begin_plan = queued
     values = np.array([5])
@@ -462,8 +465,38 @@ def test_a_large_factor_is_looked_at_and_built_beside_the_caller(parts, monkeypa
     upload.post(0, PATTERN, values, 5)
     upload.settle()
     scene.loop.run(1)
-    assert used(scene) == [5] and maker.planes_used == [2] and len(maker.events) == 1
+    assert used(scene) == [5] and maker.planes_used == [2]
+    assert len(maker.events) == (1 if waits else 2), "it was begun with 11 digits where that had a plan"
     assert threads and threading.current_thread() not in threads
+
+
+@pytest.mark.parametrize("fine", [False, True])
+def test_an_inverse_is_built_while_its_digits_are_found_and_told_of_once_they_are(parts, fine):
+    """With as many digits as the one before; with others it is built again, and only that is told."""
+    scene, maker, upload = parts
+    went, known = threading.Event(), threading.Event()
+    builds = maker.build_many
+    maker.fine = {5} if fine else set()
+
+    def begun(*arguments: Any) -> list[PartitionedInverse]:
+        found = builds(*arguments)
+        went.set()
+        return found
+
+    def planes_of(factors: list[tuple[SimpleNamespace, np.ndarray]]) -> list[int]:
+        assert known.wait(30)
+        return [2 if values[0] in maker.fine else 1 for _, values in factors]
+
+    maker.build_many, maker.planes_of = begun, planes_of
+    values, applied = prepared(upload, 5)
+    assert went.wait(30) and not applied.done()
+    known.set()
+    np.testing.assert_array_equal(applied.result(30), R / 5)
+    upload.post(0, PATTERN, values, 5)
+    upload.settle()
+    scene.loop.run(1)
+    assert used(scene) == [5] and maker.planes_used == [2 if fine else 1]
+    assert len(maker.events) == (2 if fine else 1)
 
 
 def test_settled_means_used_by_the_next_step_even_if_others_wait(parts):
@@ -526,6 +559,32 @@ class Mailbox:
     def post(self, data: bytes, keep: Any = None, event: int | None = None) -> SimpleNamespace:
         self.taken, self.posted = False, keep.step
         return SimpleNamespace(taken=0)
+
+
+def test_of_factors_that_come_faster_than_they_are_built_the_newest_wait(many, monkeypatch):
+    """The thread that builds has no more than it is about to build, so that what waits is not built when it is old:
+    those first whose body has waited longest."""
+    maker, upload, boxes = many
+    monkeypatch.setattr(module, "TOGETHER", 1)
+    go, begun, chosen, choose = threading.Event(), threading.Event(), [], maker.planes_of
+
+    def slow(factors: list[tuple[SimpleNamespace, np.ndarray]]) -> list[int]:
+        begun.set()
+        assert go.wait(30)
+        chosen.extend(int(values[0]) for _, values in factors)
+        return choose(factors)
+
+    maker.planes_of = slow
+    for value in range(10, 80, 10):
+        post_all(upload, [value + body for body in range(len(boxes))])
+        upload.advance()
+    assert begun.wait(30) and not chosen
+    go.set()
+    while not all(box.posted for box in boxes):
+        maker.thread.submit(lambda: None).result()
+        upload.advance()
+    expected = [10, 11, *(70 + body for body in range(2, len(boxes)))]
+    assert chosen == expected == [box.posted for box in boxes]
 
 
 def test_many_are_built_beside_the_caller(many):
@@ -600,7 +659,10 @@ def test_one_of_many_that_cannot_be_used_is_told_alone(many, caplog):
             raise NoMemory("full")
         return storage()
 
-    maker.storage = spoiled
+    def full(number: int) -> list[list[int]]:
+        raise NoMemory("full")  # for all together; they are made one by one then
+
+    maker.storage, maker.several_storages = spoiled, full
     with caplog.at_level(logging.WARNING):
         post_all(upload, list(range(1, len(boxes) + 1)))
         maker.thread.submit(lambda: None).result()

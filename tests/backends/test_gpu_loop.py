@@ -13,6 +13,7 @@ import pytest
 
 from sim_server.backends import ring_buffers
 from sim_server.backends.cpu.structs import REACTION, REACTION_KINDS
+from sim_server.backends.gpu import loop as loop_module
 from sim_server.backends.gpu.loop import BATCH, CAPACITY, FRAMES
 from sim_server.backends.gpu.mailbox import ChangeMailbox
 from sim_server.backends.gpu.structs import NEWTON_RESULT, PAIR_SUM, STAGE_RESULT
@@ -115,6 +116,17 @@ def test_a_matrix_that_no_step_makes_is_made_before_the_step_for_a_copy():
         scene.loop.run(5)
     assert made == [10, 15] and scene.loop.matrix_step(1) == 15 and (target == 115).all()
     assert scene.loop.matrix_step(0) == 20 and (positions == 21).all()
+
+
+def test_memory_of_copies_may_be_made_before_the_first_request(monkeypatch):
+    scene, made = FakeScene(bodies=2), []
+    scene.loop.prepare_copies()
+    monkeypatch.setattr(scene.device, "pinned", made.append)
+    monkeypatch.setattr(scene.device, "memory", made.append)
+    target = np.zeros((2, 3, 3))
+    scene.loop.request_matrix(1, target)
+    scene.loop.run(5)
+    assert scene.loop.matrix_step(1) >= 0 and made == []
 
 
 def test_the_elastic_energy_is_evaluated_after_the_steps_where_it_is_wanted():
@@ -647,3 +659,40 @@ def test_parameters_are_copied_between_batches_all_together() -> None:
     scene.device.fail = "on_device"
     with pytest.raises(DeviceLost, match="on_device"):
         scene.loop.run(1)
+
+
+def test_a_matrix_in_the_memory_of_the_loop_is_not_copied_once_more():
+    """A request with other memory is served as ever; each leaves alone the matrix of the request before."""
+    scene = FakeScene(bodies=3)
+    scene.loop.run(20)
+    own, target = [scene.loop.copy_memory(k) for k in range(3)], np.full((2, 3, 3), np.nan)
+    assert all(scene.loop.copy_memory(k) is memory and memory.shape == (2, 3, 3) for k, memory in enumerate(own))
+    scene.loop.request_matrix(0, own[0])
+    scene.loop.request_matrix(2, own[2])
+    assert scene.loop.matrix_steps([0, 1, 2]).tolist() == [-1, -1, -1]
+    scene.loop.run(40)
+    assert scene.loop.matrix_steps([2, 1, 0]).tolist() == [20, -1, 20]
+    assert (own[0] == 20).all() and (own[2] == 20).all() and not own[1].any()
+    next_one = scene.loop.copy_memory(0)
+    scene.loop.request_matrix(0, next_one)
+    scene.loop.request_matrix(1, own[1])
+    scene.loop.run(40)
+    assert scene.loop.matrix_steps([0, 1, 2]).tolist() == [60, 60, 20]
+    assert (own[0] == 20).all() and (next_one == 60).all() and (own[1] == 60).all() and (own[2] == 20).all()
+    scene.loop.request_matrix(1, target)
+    scene.loop.request_matrix(0, scene.loop.copy_memory(0))
+    scene.loop.run(40)
+    assert scene.loop.matrix_steps([0, 1, 2]).tolist() == [100, 100, 20]
+    assert (own[0] == 100).all() and (next_one == 60).all() and (own[1] == 60).all() and (target == 100).all()
+
+
+@pytest.mark.parametrize("real", ["f4", "f8"])
+def test_matrices_of_another_type_or_large_ones_have_no_memory_of_the_loop(monkeypatch, real):
+    if real == "f8":
+        monkeypatch.setattr(loop_module, "DOUBLED", 100)
+    scene, target = FakeScene(bodies=2, real=real), np.zeros((2, 3, 3))
+    assert scene.loop.copy_memory(1) is None
+    for step in (0, 40):
+        scene.loop.request_matrix(1, target)
+        scene.loop.run(40)
+        assert scene.loop.matrix_step(1) == step and (target == step).all()

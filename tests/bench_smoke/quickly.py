@@ -17,9 +17,10 @@ UNKNOWN = ("age", "next factor")  # may be unknown in any bench
 UNKNOWN_IN = {  # of other steps; without a goal; of a step not ours; without CHOLMOD; without energy, or an estimate
     "accuracy": ("step error", "solve error"), "contact": ("goal ms", "loop ms"),
     "cpu": ("iterations", "residual", "wall"), "factors": ("of CHOLMOD",), "rosenbrock": ("energy", "estimate"),
+    "speed": ("in use", "at most", "oldest"),
 }  # fmt: skip
 TIME = float(os.environ.get("PYTEST_TIMEOUT", 120)) - 10  # s, less than the test may take
-WITHOUT_PICTURE = ("faults", "gallery", "service")
+WITHOUT_PICTURE = ("faults", "gallery", "service", "speed")
 
 
 def bench(name: str, out: Path, *arguments: str) -> dict[str, Any]:

@@ -8,7 +8,20 @@ import pytest
 from tests.bench_smoke.quickly import writes_its_report
 from tests.support.browser import missing
 
-BENCHES = ("attacks", "build", "cpu", "faults", "figure4", "gallery", "haptics", "scaling", "service", "soak", "web")
+BENCHES = (
+    "attacks",
+    "build",
+    "cpu",
+    "faults",
+    "figure4",
+    "gallery",
+    "haptics",
+    "scaling",
+    "service",
+    "soak",
+    "speed",
+    "web",
+)
 pytestmark = [pytest.mark.system, pytest.mark.slow]
 
 

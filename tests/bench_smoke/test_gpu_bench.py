@@ -153,17 +153,22 @@ def test_pieces_become_one_page(found: tuple[Beams, Any], tmp_path: Path) -> Non
     )  # fmt: skip
     other = one | {"us p50": 11.5, "settings": "solver.threads=2"}
     second = piece(tmp_path / "b.json", [one | {"us p50": 22.5}, other])
-    gpu.merge([first, second], tmp_path / "out")
+    card = DEVICE | {"gpu": "other", "copy TB/s": 4.0}
+    third = piece(tmp_path / "c.json", [one | {"us p50": 15.0}], device=card)
+    gpu.merge([third, first, second], tmp_path / "out")
     text = (tmp_path / "out" / "gpu.md").read_text()
     lines = [line.split(" | ") for line in text.splitlines() if line.startswith("| 540 tets")]
-    assert lines and lines[0][2:4] == ["22.5", "0.5"] and "321" in lines[0]  # ours, over the aim of 45; direct
-    assert "| 512 beams of 540 | 500 | 1000 | 2 |" in text and "5.12e+05" not in text and "| 512000 |" in text
-    assert text.count("| 540 tets |") == 1 and "| solver.threads=2 | 11.5 |" in text
-    assert "pieces = 2" in text and "commit b" in text and "| 2026-01-01 | a | none | steps |" in text
-    assert "| cpu | 77 | 12 |" in text
+    assert lines[0][1:5] == ["none", "45", "22.5", "0.5"] and "321" in lines[0]  # ours, over the aim of 45; direct
+    assert lines[1][1:5] == ["other", "45", "15", "0.333"] and "321" not in lines[1]
+    floors = table_under(text, "Bytes and latencies")
+    assert {row["copy TB/s"] for row in floors if row["beams"] == "1"} == {"2", "4"}
+    assert "| 512 beams of 540 | none | 500 | 1000 | 2 |" in text and "5.12e+05" not in text and "| 512000 |" in text
+    assert text.count("| 540 tets | none |") == 1 and "| solver.threads=2 | 11.5 |" in text
+    assert "pieces = 3" in text and "commit b" in text and "| 2026-01-01 | a | none | steps |" in text
+    assert table_under(text, "With a worker process")[0]["us p50"] == "77"
     beside = table_under(text, "Several linearizations")
     assert [row["of one"] for row in beside if row["needed"] == "2"] == ["1.25"]
-    assert text.index("Forces: what the kernels over elements") < text.index("| 3000 | 80 | 1.5 |")
+    assert text.index("Forces: what the kernels over elements") < text.index("| none | 3000 | 80 | 1.5 |")
     assert (tmp_path / "out" / "gpu.png").read_bytes().startswith(b"\x89PNG")
     again = json.loads((tmp_path / "out" / "gpu.json").read_text())
     assert page.merged([again["data"]]) == again["data"]

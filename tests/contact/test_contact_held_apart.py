@@ -9,6 +9,8 @@ import pytest
 from sim_server.backends.kinds import KINDS
 from sim_server.simulation import Simulation
 from tests.contact.scenes import D, block, floor, over
+from tests.contact.test_contact_sweep import SMALL, plate
+from tests.contact.test_contact_triangles import obstacle
 from tests.state import put
 
 STATUS = KINDS.enumeration("Status")
@@ -40,6 +42,31 @@ def test_what_passes_is_held_back_on_both_sides_and_counted_and_momentum_is_kept
     records = sim.engine.records().reshape(-1, 2)
     assert records["clipped"].any() and np.array_equal(*records["clipped"].T)
     assert abs(sim.world.mass @ sim.world.v - before).max() <= 1e-9 * sim.world.mass.sum() * speed
+
+
+def dropped_on(obstacle: dict, linearizations: int = 1) -> Simulation:
+    options = {"contact": SOFT, "solver": JACOBI, "integrator": {"linearizations": linearizations}}
+    return over(obstacle, velocity=(0, -30, 0), at=(0, 0.05, 0), **options, **SMALL)
+
+
+SOFT = {"thickness": D, "stiffness": 1e-3, "passes": 3}
+SET_BACK = {
+    "bodies": lambda: thrown(3.0, stiffness=1e-4, passes=60),
+    "nodes": lambda: dropped_on(plate(0.002)),
+    "triangles": lambda: dropped_on(obstacle("rod")),
+    "linearizations": lambda: dropped_on(plate(0.002), 20),
+}
+
+
+@pytest.mark.parametrize("what", SET_BACK)
+def test_a_step_that_sets_nodes_back_has_not_converged(what):
+    """It does not end where its solve did, also if the law holds there."""
+    sim = SET_BACK[what]()
+    sim.engine.run(8)
+    records = sim.engine.records()
+    moved = records[records["clipped"] > 0]
+    assert (moved["contact_residual"] <= sim.scene.effects["contact"].tolerance).any()
+    assert set(moved["status"]) == {STATUS["CONTACT"]}
 
 
 def test_objects_that_begin_inside_each_other_are_told_with_the_depth(caplog):

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from sim_server.backends.cpu import engine as engine_module
+from sim_server.backends.cpu import corrections
 from sim_server.backends.kinds import Kind
 from sim_server.simulation import Simulation
 from sim_server.updates.driver import Driver
@@ -92,7 +92,7 @@ def test_a_factor_replaced_in_mid_contact_knows_what_it_knows():
 
 
 def test_a_memory_too_short_costs_iterations_not_the_answer(known, monkeypatch):
-    monkeypatch.setattr(engine_module, "KNOWN_CONTACTS", (1, 1))
+    monkeypatch.setattr(corrections, "KNOWN_CONTACTS", (1, 1))
     sim = pressed()
     run(sim, PRESSED // 2)
     driver = Driver(sim)

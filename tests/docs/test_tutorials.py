@@ -12,7 +12,8 @@ import pytest
 
 from tests.docs import tutorials
 
-pytestmark = pytest.mark.system
+pytestmark = [pytest.mark.system, pytest.mark.timeout(3 * tutorials.LONGEST)]
+MORE_TIME = tutorials.Advice("more --minutes", "--minutes 0.5", "--minutes 5")
 
 
 def test_first_five_minutes(tmp_path: Path) -> None:
@@ -57,8 +58,16 @@ def test_many_workers(tmp_path: Path) -> None:
 
 
 def test_accuracy_against_time(tmp_path: Path) -> None:
-    done = tutorials.run("accuracy_against_time", tmp_path)
-    assert len(json.loads((done.folder / "measured" / "points.json").read_text())["points"]) > 1
+    reader = tutorials.Reader(tmp_path, MORE_TIME)
+    done = reader.read(tutorials.page("accuracy_against_time"))
+
+    def points() -> int:
+        return len(json.loads((done.folder / "measured" / "points.json").read_text())["points"])
+
+    for _ in range(3):  # a full machine goes on where it was, with more time
+        if points() < 2:
+            reader.command("sim-client accuracy plank.toml --minutes 5 --duration 0.2 --out measured")
+    assert points() > 1
     assert (done.folder / "plank.plan.toml").exists()
 
 
@@ -72,6 +81,15 @@ def test_blocks_of_a_page() -> None:
     found = tutorials.blocks(page)
     assert [(block.language, block.file) for block in found] == [("toml", "a.toml"), ("sh", ""), ("", "")]
     assert found[1].text.startswith(tutorials.APART)
+
+
+def test_a_reader_follows_the_advice_of_a_command_that_fails(tmp_path: Path) -> None:
+    page = [tutorials.Block("sh", "test 2 = 3 || { echo too little >&2; exit 1; }; echo 3")]
+    with pytest.raises(AssertionError, match="too little"):
+        tutorials.Reader(tmp_path).read(page)
+    (tmp_path / "again").mkdir()
+    advice = tutorials.Advice("too little", "2 = 3", "3 = 3")
+    assert tutorials.Reader(tmp_path / "again", advice).read(page).output == "3\n"
 
 
 def test_a_command_that_fails_is_told(tmp_path: Path) -> None:

@@ -166,19 +166,28 @@ def test_another_build_may_make_the_workspace_grow(gpu):
     assert np.array_equal(storage.matrix.get(), before)
 
 
+@pytest.mark.parametrize("pinned", [False, True])
 @pytest.mark.parametrize(("groups", "planes", "limit"), [(1, 1, None), (2, 1, 3), (3, 2, 5)])
-def test_several_at_a_time_have_the_bits_of_each_alone(gpu, groups, planes, limit):
-    """Whatever their number: graphs are made for 1, 4, 16 and 64, and what they leave over is not touched."""
+def test_several_at_a_time_have_the_bits_of_each_alone(gpu, groups, planes, limit, pinned):
+    """Whatever their number: graphs are made for 1, 4, 16 and 64, and what they leave over is not touched. pinned: most
+    of them lie one behind the other in page-locked memory, as those of a message do"""
     from sim_server.backends.gpu.inverse.build_inverse import InverseBuilder
+    from sim_server.backends.gpu.pinned import is_pinned, pinned_array
 
     factors = [factor(SMALL, seed) for seed in range(21)]
     shape, values = factors[0][0], [each[1] for each in factors]
     p = plan(shape, 4, groups, planes)
     alone = [expanded(gpu, shape, each, p, limit) for each in values]
+    if pinned:
+        rows = pinned_array(gpu.cp, len(values) * len(values[0]), np.dtype(np.float32)).reshape(len(values), -1)
+        order = [0, 1, 2, 4, 3, *range(5, 21)]
+        rows[order] = values
+        values = [rows[place] for place in order]
+        assert all(is_pinned(each) for each in values)
     builder = InverseBuilder(gpu, shape, p, 64)
     assert builder.most == 64
     for count in (1, 2, 4, 5, 21):
-        storages = [builder.storage() for _ in range(22)]
+        storages = builder.several_storages(22) if pinned else [builder.storage() for _ in range(22)]
         made = builder.build_many(values[:count], storages[:count], limit)
         made[-1].event.synchronize()
         for storage, inverse, (chunks, scale) in zip(storages, made, alone, strict=False):

@@ -3,14 +3,16 @@
 
 import logging
 from collections.abc import Callable
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
-from protocol.channels import PROTOCOL
+from protocol.channels import PART_BYTES, PROTOCOL
 from protocol.counters import Counters
 from protocol.messages_pb2 import Header, Topology
+from protocol.shared_memory.limits import POOL_LIMIT, SLOT_SHARE
 from sim_server.network import job_sender
 from sim_server.network.bookkeeping import Bookkeeping
 from sim_server.network.factor_decoder import FactorDecoder
@@ -20,6 +22,8 @@ from sim_server.network.worker_registry import WorkerRegistry
 from sim_server.network.worker_reliability import WorkerReliability
 from sim_server.network.worker_timing import WorkerTiming
 from sim_server.updates.factor_source import Job
+
+SHARE = POOL_LIMIT // SLOT_SHARE  # bytes of the largest factor that comes in a slot
 
 
 class Number(int):
@@ -104,3 +108,15 @@ def test_jobs_are_sent_while_the_times_of_others_are_forgotten(monkeypatch: pyte
     assert [sender.sent_at(job) for job in over] == [float("inf")] * 3
     assert len(leases.jobs) == 3 and flying in leases.jobs
     assert [sender.sent_at(job) for job in leases.jobs] == [7.0] * 3
+
+
+@pytest.mark.parametrize(
+    ("values", "bytes_"), [(1000, 4000), (30 << 20, 120 << 20), (SHARE // 4, SHARE), (SHARE // 4 + 1, PART_BYTES)]
+)
+def test_the_slot_of_a_factor_is_made_once_its_pattern_is_known(values: int, bytes_: int) -> None:
+    """That for a part where it comes in parts."""
+    prepared: list[int] = []
+    pool = SimpleNamespace(limit=POOL_LIMIT, prepare=prepared.append)
+    sender: Any = JobSender(*[None] * 2, 1, pool, *[None] * 4)  # type: ignore[arg-type]
+    sender.prepare_for(SimpleNamespace(nonzeros=values))
+    assert prepared == [bytes_]

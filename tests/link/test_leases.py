@@ -13,8 +13,8 @@ class Allocator:
     def __init__(self) -> None:
         self.back: list[object] = []
 
-    def give_back(self, slot: object) -> None:
-        self.back.append(slot)
+    def give_back(self, slot: object, users: int = 1) -> None:
+        self.back += [slot] * users
 
 
 def sent(leases: Leases, object: str = "beam", worker: str = "w", deadline: float = 2.0, epoch: int = 1) -> InFlightJob:
@@ -42,6 +42,33 @@ def test_an_answer_frees_object_worker_and_slots(leases: Leases, allocator: Allo
     with pytest.raises(Refused, match="already answered") as refused:
         leases.match_answer(1, "w", 1)
     assert refused.value.kind == "duplicate"
+
+
+def test_answers_of_a_message_free_what_each_would_alone(allocator: Allocator) -> None:
+    """Jobs of one message share their slots, which are free once all are answered."""
+
+    def run(together: bool) -> tuple[Leases, list[object]]:
+        allocator.back = []
+        leases = Leases(allocator)
+        sent(leases, "late", deadline=0.5)
+        leases.expire(1.0)
+        jobs = [replace(sent(leases, name), slots=("matrices", "factors")) for name in "abcd"]  # type: ignore[arg-type]
+        for job in jobs:
+            leases.start(job)
+        if together:
+            leases.finish_all(jobs[:3], [0.1, 0.2, 0.3])
+        else:
+            for job, seconds in zip(jobs[:3], (0.1, 0.2, 0.3), strict=True):
+                leases.finish(job, seconds)
+        return leases, allocator.back
+
+    (one, back), (other, expected) = run(True), run(False)
+    assert sorted(back) == sorted(expected) and back.count("factors") == 3 and "slot 1" in back
+    assert one.by_object.keys() == other.by_object.keys() == {"d"} and one.count("w") == other.count("w") == 1
+    assert one.deadlines() == other.deadlines() and one.expired_count("w") == other.expired_count("w") == 0
+    for name in "abcd":
+        assert one.lease(name, "w") == other.lease(name, "w")
+        assert one.exclusive_period(name, 10) == other.exclusive_period(name, 10)
 
 
 @pytest.mark.parametrize(

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: MIT
 """The worker's loop without a network: what it keeps, drops and answers."""
 
+import json
 import logging
 import re
 import sys
@@ -84,7 +85,10 @@ class FakeConnection:
         self.offered = FakeOffers()
         self.answers: list[tuple[Factor, bytes]] = []
         self.patterns: list[tuple[str, int]] = []
-        self.asked: list[tuple[str, int]] = []
+        self.asked: list[tuple[str, int | None]] = []
+        self.objects: dict[str, int] = {}  # nodes of those that the scene tells of
+        self.preconditioner = "cholesky"
+        self.told, self.together = 0, 0  # times that it said hello; matrices that it factorizes together
         self.without_token: set[int] = set()
 
     def has_token(self, incarnation: int) -> bool:
@@ -96,17 +100,22 @@ class FakeConnection:
     def header(self, object: str, epoch: int, channel: str) -> Header:
         return Header(protocol=PROTOCOL, incarnation=self.incarnation, object=object, epoch=epoch)
 
-    def topology(self, object: str, epoch: int) -> Topology:
+    def topology(self, object: str, epoch: int | None = None) -> Topology:
         self.asked.append((object, epoch))
         if object == "unknown":
             raise Refused("the server has no topology of unknown", "object")
-        header = self.header(object, epoch, "")
-        row_start = np.arange(3, dtype=np.int32)
-        return Topology(header=header, nodes=2, row_start=row_start.tobytes(), columns=row_start[:2].tobytes())
+        header, nodes = self.header(object, epoch or 1, ""), self.objects.get(object, 2)
+        row_start = np.arange(nodes + 1, dtype=np.int32)
+        return Topology(header=header, nodes=nodes, row_start=row_start.tobytes(), columns=row_start[:-1].tobytes())
 
     def scene(self) -> Scene:
         self.asked.append(("scene", 0))
-        return Scene()
+        if not self.objects:
+            return Scene()
+        return Scene(objects=self.objects, resolved=json.dumps({"solver": {"preconditioner": self.preconditioner}}))
+
+    def tell(self) -> None:
+        self.told += 1
 
     def send_pattern(self, pattern: FactorPattern, object: str, epoch: int) -> None:
         self.patterns.append((object, epoch))
@@ -125,6 +134,7 @@ def worker(connection: FakeConnection) -> Worker:
     worker = Worker(connection, Diagonal)  # type: ignore[arg-type]
     connection.received.put(ServersThere((7,)))
     worker.step(0.0)
+    connection.asked.clear()  # for the scene
     return worker
 
 
@@ -172,6 +182,80 @@ def test_the_server_is_not_asked_for_a_topology_that_is_known(worker: Worker, co
     assert "blocks is 3; allowed: 2" in failures["e"]
 
 
+LARGE = 2000  # nodes of an object that is worth it
+
+
+class Ready(Diagonal):
+    """One whose first matrix would wait for memory."""
+
+    made: ClassVar[list[int]] = []
+    ready: ClassVar[list[int]] = []
+    error: ClassVar[Exception | None] = None
+
+    def __init__(self, row_start: np.ndarray, columns: np.ndarray, method: Method):
+        super().__init__(row_start, columns, method)
+        self.made.append(self.size)
+
+    def make_ready(self) -> None:
+        if self.error is not None:
+            raise self.error
+        self.ready.append(self.size)
+
+
+@pytest.fixture
+def ahead(connection: FakeConnection, monkeypatch: pytest.MonkeyPatch) -> Worker:
+    for name in ("made", "ready"):
+        monkeypatch.setattr(Ready, name, [])
+    connection.objects = {"small": 3, "large": LARGE, "twin": LARGE, "unknown": LARGE}
+    connection.received.put(ServersThere((7,)))
+    return Worker(connection, Ready)  # type: ignore[arg-type]
+
+
+def test_large_objects_are_made_ready_for_before_their_first_matrix(ahead: Worker, connection: FakeConnection) -> None:
+    ahead.take_in(0.0)
+    assert ahead.waiting == 1 and not ahead.idle, "the server may wait for that"
+    while ahead.waiting:
+        ahead.step(0.0)
+    assert Ready.made == [3 * LARGE] and Ready.ready == [3 * LARGE] * 2, "once for objects of one topology"
+    assert connection.patterns == [("large", 1), ("twin", 1)] and connection.answers == []
+    assert ahead.idle and connection.told == 1 and connection.counters.jobs == 0
+    asked = len(connection.asked)
+    drain(ahead, connection, matrix(object="large", blocks=LARGE, omega=1.0))
+    assert len(connection.asked) == asked and Ready.made == [3 * LARGE]
+
+
+def test_a_job_goes_before_what_is_to_be_prepared(ahead: Worker, connection: FakeConnection) -> None:
+    connection.received.put(matrix(object="first"))
+    ahead.step(0.0)
+    assert [answer.header.object for answer, _ in connection.answers] == ["first"] and ahead.waiting == 1
+    assert connection.asked == [("first", 1)] and connection.told == 0
+
+
+@pytest.mark.parametrize(("preconditioner", "count"), [("ssor_factor", 1), ("cholesky", 9)])
+def test_nothing_is_prepared_for_other_factors_or_where_objects_are_many(
+    ahead: Worker, connection: FakeConnection, preconditioner: str, count: int
+) -> None:
+    connection.preconditioner, connection.objects = preconditioner, {f"body{k}": LARGE for k in range(count)}
+    while not ahead.idle:
+        ahead.step(0.0)
+    assert connection.asked == [("scene", 0)] and Ready.made == []
+
+
+def test_what_cannot_be_prepared_is_left_for_the_first_job(
+    ahead: Worker, connection: FakeConnection, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Ready, "error", MemoryError("full"))
+    while not ahead.idle:
+        ahead.step(0.0)
+    assert Ready.ready == []
+    drain(ahead, connection, matrix(object="first"))
+    assert [answer.failure for answer, _ in connection.answers] == [""], "it lives on"
+    monkeypatch.setattr(Ready, "error", DeviceUnusable("gone"))
+    ahead._unprepared.append("large")
+    with pytest.raises(DeviceUnusable):
+        ahead.step(0.0)
+
+
 class Together(Diagonal):
     """Factorizes up to three matrices of one pattern together."""
 
@@ -214,6 +298,7 @@ def test_objects_of_one_pattern_are_factorized_together(together: Worker, connec
         assert (answer.header.object, answer.job, answer.failure) == ("abcd"[k], 10 + k, "")
         np.testing.assert_array_equal(np.frombuffer(data, np.float32), np.float32(np.sqrt(4.0 + k)))
     assert len(connection.answers) == 4 and connection.counters.jobs == 8 and connection.received.idle
+    assert connection.together == Together.most == 3, "as the server is told"
 
 
 def test_one_without_a_factor_does_not_spoil_those_of_others(together: Worker, connection: FakeConnection) -> None:

@@ -68,9 +68,11 @@ def test_a_large_slot_is_made_beside_those_who_do_not_wait(monkeypatch: pytest.M
     small = pool.lend(8000, beside=True)
     assert small is not None and pool.bytes >= size
     assert pool.lend(20 << 20) is None, "there is no room beside it"
+    assert pool.makes_any
     go.set()
     while pool.is_making(size):
         pool.lend(8000)
+    assert not pool.makes_any
     slot = pool.lend(size, beside=True)
     assert slot is not None and slot.capacity >= size
     assert len(made) == 1 and made[0] is not threading.current_thread()

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_server.backends.cpu.engine import NativeFactor
+from sim_server.backends.cpu.factors import NativeFactor
 from sim_server.backends.kinds import Kind
 from sim_server.simulation import Simulation
 from tests.scenes import bar, simulation

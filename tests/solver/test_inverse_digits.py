@@ -6,13 +6,22 @@ import pytest
 
 from precond_worker.factorization.factorize import Analysis
 from protocol.factor import FactorPattern
-from sim_server.backends.gpu.inverse.digits import MOST_RESPONSE, largest_response, planes_for
+from sim_server.backends.gpu.inverse import digits as module
+from sim_server.backends.gpu.inverse.digits import FEW, MOST_RESPONSE, largest_responses, planes_of
 from sim_server.simulation import Simulation
 from tests.hard_cases.case import BAR, GRAVITY, young
 from tests.support.digits import iterations_by_digits
 from tests.worker.block_matrices import bar_edges, dense_matrix, pattern, spd
 
 SMALL = "object.bar.mesh={ bar = [2, 2, 8], size = [1, 1, 4] }"
+
+
+def largest_response(of: FactorPattern, values: np.ndarray) -> float:
+    return float(largest_responses(of, [values])[0])
+
+
+def planes_for(of: FactorPattern, values: np.ndarray) -> int:
+    return planes_of([(of, values)])[0]
 
 
 def exact(matrix: np.ndarray) -> float:
@@ -43,6 +52,26 @@ def test_units_and_ratios_between_nodes_do_not_change_it():
     found = [largest_response(pair, np.array([a, 0.9 * b, b])) for a, b in ((1, 1), (1e3, 1), (1e-3, 1e6))]
     assert found == pytest.approx([found[0]] * 3, rel=1e-5)
     assert found[0] == pytest.approx(exact(np.array([[1, 0.9], [0.9, 1.81]])), rel=0.5)
+
+
+@pytest.mark.parametrize("helpers", [0, 3])
+def test_each_of_many_gets_what_it_would_get_alone(monkeypatch, helpers):
+    """Of several patterns, in whatever order, by one thread or by several; one with NaN spoils no other."""
+    monkeypatch.setattr(module, "helping_threads", lambda: helpers)
+    graphs = [pattern(60, bar_edges(2, 3, 4)), pattern(7, np.empty((0, 2), int))]
+    made = [Analysis(*graph) for graph in graphs]
+    factors = [
+        (made[k % 5 == 3].pattern, made[k % 5 == 3].factorize(spd(*graphs[k % 5 == 3], seed=k), np.float32))
+        for k in range(4 * FEW)
+    ]
+    factors[6][1][:] *= np.where(np.arange(len(factors[6][1])) < 3, 1e-4, 1.0).astype(np.float32)
+    factors[9][1][5] = np.nan
+    alone = [planes_for(*each) for each in factors]
+    assert planes_of(factors) == alone and alone[9] == 2 and set(alone) == {1, 2}
+    own = [values for of, values in factors if of is made[0].pattern]
+    assert np.array_equal(
+        largest_responses(made[0].pattern, own), [largest_response(made[0].pattern, v) for v in own], equal_nan=True
+    )
 
 
 def test_the_same_factor_always_gets_the_same_and_one_with_nan_gets_22():

@@ -53,7 +53,7 @@ def test_it_saves_iterations_where_the_body_changed_most_and_never_changes_the_a
     assert not any(none) and max(nodes) > 3
     assert (records["status"] == 0).all() and (records["residual"] <= 1e-6).all()
     late = np.array(nodes) > 0
-    assert records["iterations"][late].max() < 0.8 * others["iterations"].max()
+    assert records["iterations"][late][1:].max() < 0.8 * others["iterations"].max()
     assert records["iterations"].sum() < others["iterations"].sum()
     first = int(np.argmax(late))
     assert late[first:].all() and records["iterations"][first] > AFTER  # once, the factor was tried alone

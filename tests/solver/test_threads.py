@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from precond_worker.factorization.factorize import Analysis
 from protocol.factor import FactorPattern
 from sim_server.backends.cpu import processors
-from sim_server.backends.cpu.engine import SHARED_SIZE, NativeFactor, NativePattern
+from sim_server.backends.cpu.factors import SHARED_SIZE, NativeFactor, NativePattern
 from sim_server.simulation import Simulation
 from tests.scenes import bar, factor_of, simulation
 

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from sim_server.backends.cpu import engine as engine_module
-from sim_server.backends.cpu.engine import NativeFactor
+from sim_server.backends.cpu import corrections
+from sim_server.backends.cpu.factors import NativeFactor
 from sim_server.effects.touch import Interaction, Touch
 from sim_server.errors import InputError
 from sim_server.simulation import Simulation
@@ -223,7 +223,7 @@ def test_a_spring_at_its_limit_is_no_change_and_counts_again_once_it_gives_way()
 
 def test_changes_too_long_ago_are_not_guessed(monkeypatch):
     """A factor from before what is remembered is used as it is; the next one is corrected again."""
-    monkeypatch.setattr(engine_module, "HISTORY", 3)
+    monkeypatch.setattr(corrections, "HISTORY", 3)
     sim, touch = touched(**EXACT)
     factors = []
     held = None

@@ -288,13 +288,13 @@ def test_large_batches_are_decoded_beside_the_caller(stage: Hand, monkeypatch: p
     """All count as large here. Meanwhile nothing is taken and second answers are refused; then each counts alone."""
     monkeypatch.setattr(factor_intake, "LARGE", 0)
     batch, go = stage.batch(), threading.Event()
-    decode, before = stage.driver.link.dispatch.decoder.decode_one, stage.driver.link.counters.refusals["duplicate"]
+    decode, before = stage.driver.link.dispatch.decoder.decode_several, stage.driver.link.counters.refusals["duplicate"]
 
     def slow(*arguments: Any) -> Any:
         assert go.wait(30)
         return decode(*arguments)
 
-    monkeypatch.setattr(stage.driver.link.dispatch.decoder, "decode_one", slow)
+    monkeypatch.setattr(stage.driver.link.dispatch.decoder, "decode_several", slow)
     message = stage.answer(batch, [0, 1, 1, 2, 3])
     message.checksums[3] = 7
     stage.send(message)

@@ -2,17 +2,25 @@
 """The first step of a server in real time waits for its factors, tells so, and obeys commands meanwhile."""
 
 import threading
+from contextlib import ExitStack
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
 from clients.client import Client
 from clients.log.reader import Log
+from sim_server import cli
+from sim_server.errors import InputError
 from sim_server.network.link import ServerLink
 from sim_server.replay.log import Recording
 from sim_server.replay.run import Replay
 from sim_server.service.service import Service
+from sim_server.service.supervisor import Supervisor
 from sim_server.simulation import Simulation
+from sim_server.startup import set_up
+from sim_server.startup.options import Options
 from tests.ports import free_endpoint
 from tests.system.hand_worker import HandWorker
 from tests.system.link_helpers import PATIENCE
@@ -74,3 +82,64 @@ def test_a_run_that_does_not_wait_sends_the_matrix_of_its_very_first_step(tmp_pa
             service.commands.stopping = True
             thread.join(PATIENCE)
     assert not thread.is_alive()
+
+
+def test_a_worker_is_ready_for_a_large_object_before_its_first_matrix(tmp_path: Path) -> None:
+    """It has sent the pattern of the factors, so that their size is known, and the server finds out."""
+    endpoint = free_endpoint()
+    with ServerLink(listen=[endpoint]) as link, ExitStack() as closing:
+        service = Service(Simulation.load(beam(tmp_path, bar=(8, 8, 12))), link)
+        known = link.dispatch.decoder.objects["beam"]
+        assert not service.ready() and known.most_values("cholesky") == 0
+        supervisor = Supervisor(1, "sim", [endpoint])
+        closing.callback(supervisor.close)
+        until(service.ready, "all is ready")
+        assert known.most_values("cholesky") > 0 and link.counters.jobs == 0
+        assert [pattern.nonzeros for pattern in known.patterns.values()] == [known.most_values("cholesky")]
+
+
+@pytest.mark.parametrize(
+    ("joins", "prepared", "begins"), [(2, 2.5, 2.5), (2, 99, 2 + cli.READY_TIMEOUT), (99, 99, cli.WORKER_TIMEOUT)]
+)
+def test_the_start_waits_until_all_is_ready_and_not_for_ever(
+    monkeypatch: pytest.MonkeyPatch, joins: float, prepared: float, begins: float
+) -> None:
+    now = [0.0]
+
+    def sleep(seconds: float) -> None:
+        now[0] += seconds
+
+    monkeypatch.setattr(cli.time, "monotonic", lambda: now[0])
+    monkeypatch.setattr(cli.time, "sleep", sleep)
+    link = SimpleNamespace(dispatch=SimpleNamespace(workers=lambda: now[0] > joins), check_name=lambda: None)
+    service: Any = SimpleNamespace(link=link, ready=lambda: now[0] > prepared)
+    cli.wait_for_workers(service, None)
+    assert now[0] == 0
+    supervisor: Any = SimpleNamespace(check=lambda: None)
+    cli.wait_for_workers(service, supervisor)
+    assert now[0] == pytest.approx(begins, abs=0.05)
+
+
+def test_workers_start_before_the_service_is_built_and_end_if_it_cannot_be(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    events: list[str] = []
+
+    def start(closing: ExitStack, *_: Any) -> str:
+        events.append("begin")
+        closing.callback(events.append, "end")
+        return "supervisor"
+
+    def fail(*_: Any) -> None:
+        events.append("service")
+        raise InputError("spoiled")
+
+    monkeypatch.setattr(set_up, "start_workers", start)
+    monkeypatch.setattr(set_up, "make_service", fail)
+    options = Options(
+        beam(tmp_path, bar=(1, 1, 2)), [], "cpu", "sim", [free_endpoint()], None, True, None, None, True, 1, "cpu",
+        None, True, None, None, False, None, [], None, None, None,
+    )  # fmt: skip
+    with pytest.raises(InputError, match="spoiled"), ExitStack() as closing:
+        set_up.set_up(closing, options)
+    assert events == ["begin", "service", "end"]

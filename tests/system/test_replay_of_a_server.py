@@ -246,8 +246,20 @@ def test_the_automatic_preconditioner(tmp_path: Path) -> None:
     assert {f.method for f in factors} <= {"incomplete_cholesky", "cholesky"}
 
 
+def grab_and_await_factors(client: Client) -> None:
+    """What comes after the grab is made of positions; for the first of these the worker imports and compiles, which may
+    take longer than the run, so that the run stands meanwhile."""
+    push_and_grab(client)
+    for _ in range(4):
+        until(lambda: fresh(client).objects[0].in_flight, "a job is under way")
+        client.pause()
+        until(lambda: not fresh(client).objects[0].in_flight, "it is over")
+        client.resume()
+
+
 def test_factors_of_positions_sent_ahead(tmp_path: Path) -> None:
-    log = recorded(tmp_path, 'build = "worker"\nextrapolate = 0.02')
+    solver = 'build = "worker"\nextrapolate = 0.02'
+    log = recorded(tmp_path, solver, touch=grab_and_await_factors, patience=2 * PATIENCE)
     assert replayed(log, 0)["same"]
     ahead = {f.ahead for f in messages(log, "factor")}
     assert 0.0 in ahead and max(ahead) > 0, "matrices while grabbed, positions otherwise"

@@ -94,6 +94,8 @@ def test_large_factors_are_decoded_beside_the_caller(monkeypatch: pytest.MonkeyP
         driver.submit(BEAM, 1)
         answer, values = hand.right_answer(hand.receive(), BEAM)
         decoding, decode = threading.Event(), link.dispatch.decoder.decode
+        woken = threading.Event()
+        link.dispatch.wake_by(woken.set)
 
         def slow(*arguments: Any) -> Any:
             assert decoding.wait(30)
@@ -103,8 +105,9 @@ def test_large_factors_are_decoded_beside_the_caller(monkeypatch: pytest.MonkeyP
         hand.answer(answer, values)
         hand.answer(answer, values)
         driver.until(lambda: link.counters.refusals["duplicate"] == 1, "the second answer")
-        assert driver.factors == [] and link.dispatch.ready() == 0
+        assert driver.factors == [] and link.dispatch.ready() == 0 and not woken.is_set()
         decoding.set()
+        assert woken.wait(60)
         driver.until(lambda: driver.factors, "the factor")
         assert np.allclose(product(driver.factors[0]), dense(BEAM, matrix(BEAM)), atol=1e-5)
         driver.submit(BEAM, 2)

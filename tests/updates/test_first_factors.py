@@ -117,6 +117,20 @@ def test_after_the_time_out_the_step_goes_on_and_the_late_factor_is_taken_up() -
     assert driver.by_name["a"].factors.used > 0
 
 
+def test_a_job_that_is_still_read_after_the_time_out_is_of_the_first_matrix() -> None:
+    """Those that share a message are read when it leaves, by another thread."""
+    sim = simulation(*BODIES, gravity=GRAVITY, preconditioner="cholesky")
+    workers = Workers(sim)
+    driver, workers.held = Driver(sim, workers), True
+    first, _ = first_factors(driver)
+    assert first.run()
+    (job,), (step, matrix) = workers.jobs, driver.by_name["b"].job.matrix
+    before = job.values.copy()
+    driver.advance(3)
+    assert step == 0 and np.array_equal(job.values, before) and np.array_equal(matrix, before)
+    assert not np.array_equal(driver.engine.factor_matrix(1), before), "or it shows nothing"
+
+
 def test_without_a_worker_the_wait_is_short() -> None:
     sim = simulation(*BODIES, preconditioner="cholesky")
     first, time = first_factors(Driver(sim, Workers(sim, count=0)))

@@ -87,7 +87,7 @@ def noted(driver: Driver) -> list[tuple]:
     out = []
     for t in driver.bodies:
         f = t.factors
-        counts = (f.newest, f.used, f.regularized, t.job.in_flight, t.job.sent, t.failures.in_a_row)
+        counts = (f.newest, f.used, f.regularized, t.job.in_flight, t.job.sent, t.job.checked, t.failures.in_a_row)
         sums = (f.latency.value, f.cost.value, t.solves.excess, t.solves.latest, t.solves.lost, f.workers)
         out.append((*counts, *sums, {name: mean.value for name, mean in f.cost_by_method.items()}))
     return out
@@ -99,6 +99,7 @@ def test_many_factors_say_what_each_says():
     rng = np.random.default_rng(0)
     for step in range(10, 200, 3):
         chosen = rng.permutation(BODIES)[: rng.integers(1, BODIES + 1)].tolist()
+        checked, newer = rng.random((2, BODIES)) < 0.5
         asked, failed, lost = rng.random(BODIES) < 0.5, rng.random(BODIES) < 0.2, rng.uniform(0, 9, BODIES)
         factors = {}
         for k in chosen:
@@ -117,6 +118,9 @@ def test_many_factors_say_what_each_says():
                 if asked[k]:
                     state.on_job(factor.step, Method())
                     state.job.in_flight, state.job.sent = True, factor.step
+                    if checked[k]:  # beside the steps, and a newer matrix was sent meanwhile, or none
+                        state.on_check(factor.step)
+                        state.job.in_flight, state.job.sent = bool(newer[k]), factor.step + int(newer[k])
         expected = [one.bodies[k].on_factor(factor, step) for k, factor in factors.items()]
         states = [many.bodies[k] for k in factors]
         assert on_factors(states, many.table, list(factors.values()), step) == expected

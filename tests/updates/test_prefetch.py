@@ -6,6 +6,7 @@ import time
 import numpy as np
 import pytest
 
+from protocol.factor import Factor
 from sim_server.updates.driver import Driver
 from sim_server.updates.factor_source import Inline, Job
 from sim_server.updates.policies.free_running import Async
@@ -92,6 +93,45 @@ class OneAtATime(Inline):
         self.idle = 0
         self.order.append((job.object, job.step))
         return super().submit(job)
+
+
+class ManyAtATime(Inline):
+    """A worker that has `most` jobs at a time, each for `latency` calls of `poll`."""
+
+    def __init__(self, patterns, most: int, latency: int):
+        super().__init__(patterns)
+        self.most, self.latency, self.begun, self.calls = most, latency, [], 0
+
+    def ready(self) -> int:
+        return self.most - len(self.begun)
+
+    def submit(self, job: Job) -> bool:
+        if not self.ready():
+            return False
+        self.begun.append((self.calls, job))
+        return True
+
+    def poll(self) -> list[Factor]:
+        self.calls += 1
+        while self.begun and self.begun[0][0] <= self.calls - self.latency:
+            super().submit(self.begun.pop(0)[1])
+        return super().poll()
+
+
+@pytest.mark.parametrize("most", [1, 4])
+def test_the_bound_of_ages_reckons_with_the_jobs_that_a_worker_has_at_a_time(most):
+    sim = falling(*(bar(name=f"beam{k}", young=1e6, fixed="X < 0.01") for k in range(8)), update="async")
+    driver = Driver(sim, ManyAtATime(patterns_of(sim), most, latency=3))
+    ages, bounds = [], []
+    for step in range(300):
+        records = driver.advance(1)
+        if step > 200:
+            ages.append(int((records["step"] - 1 - records["factor_step"]).max()))
+            bounds.append(driver.age_bound())
+    latency = float(np.mean(driver.table.latency))
+    rounds = sim.scene.solver.schedule_rounds + 1
+    assert max(ages) <= min(bounds)
+    assert max(bounds) <= rounds * 8 * latency / most * 1.5 + 2 * driver.table.latency.max() + 4
 
 
 def prefetching(depth: int) -> tuple[Driver, Async, OneAtATime]:

@@ -43,16 +43,18 @@ def tables(status: pb.Status) -> str:
     more = f"<div>and {len(status.objects) - MOST} more</div>" if len(status.objects) > MOST else ""
     workers = _table(
         ("worker", "library", "jobs", "failed", "memory"),
-        (
-            (w.worker, w.library, w.jobs, w.failures, "shared" if w.shared_memory else "bytes")
-            for w in status.workers[:MOST]
-        ),
+        ((w.worker, w.library, w.jobs, w.failures, _memory(w)) for w in status.workers[:MOST]),
     )
     local = _table(
         ("local worker", "state", "pid", "restarts"),
         ((w.worker, w.state, w.pid or "-", w.restarts) for w in status.local_workers[:MOST]),
     )
     return f'<div style="padding:0 1em">{objects}{more}{workers}{local}</div>'
+
+
+def _memory(worker: pb.WorkerInfo) -> str:
+    """How arrays travel to and from a worker."""
+    return "device" if worker.device_memory else "shared" if worker.shared_memory else "bytes"
 
 
 def _age(steps: int) -> str:

@@ -384,7 +384,7 @@ extern "C" __global__ void __launch_bounds__(CONTACT_THREADS) finish_contact(con
     const int contacts = (int)sum[0] + (c.island_of ? c.pair_contacts[body] : 0);
     const double unknown = __longlong_as_double(0x7ff8000000000000ll);
     c.contact_results[slot * c.count + body] = {contacts || state.passes ? state.residual : unknown, contacts, state.passes, (int)sum[2]};
-    if (solve.status == CONVERGED && state.residual > c.tolerance) solve.status = CONTACT;
+    solve.status = status_in_contact(solve.status, !(state.residual > c.tolerance), (int)sum[2]);
     const bool balanced = solve.status != CONTACT && sum[2] == 0;  // else the forces are more than what acted
     if (c.balance[body].phase != FROZEN && (balanced || sum[1] > 0)) c.balance[body].work += sum[1];
 }

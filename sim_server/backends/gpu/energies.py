@@ -156,14 +156,13 @@ class DeviceEnergies:
         self._settled[:] = self._counter
         x, v = (self._gpu.twin(array).get().astype(float) for array in (e.x, e.v))
         balance = np.frombuffer(self._balance.get().tobytes(), BALANCE).copy()
-        starts = range(len(balance)) if bodies is None else bodies
-        balance["elastic"][list(starts)] = self._sum.get()[list(starts)]
+        starts = np.arange(len(balance)) if bodies is None else np.array(bodies, np.int64)
+        balance["elastic"][starts] = self._sum.get()[starts]
         if bodies is not None:
-            balance["phase"][list(bodies)] = 0  # WELL
-        sums, begin = start_sums(e.starts, e.mass, x, v, e.gravity, self._dt), library().wf_gpu_start_balance
-        rows, at = balance.ctypes.data, sums.ctypes.data
-        for body in starts:
-            begin(rows + BALANCE.itemsize * body, at + sums.strides[0] * body, self._dt, int(e.inertia))
+            balance["phase"][starts] = 0  # WELL
+        sums = np.ascontiguousarray(start_sums(e.starts, e.mass, x, v, e.gravity, self._dt))
+        arrays = starts.ctypes.data, balance.ctypes.data, sums.ctypes.data
+        library().wf_gpu_start_balances(len(starts), *arrays, self._dt, int(e.inertia))
         self._balance.set(np.frombuffer(balance.tobytes(), np.uint8))
         self.started = True
 

@@ -8,6 +8,7 @@ settings, factors and arguments.
 
 import time
 from collections.abc import Callable, Sequence
+from concurrent.futures import Future
 from functools import partial
 from typing import Any, cast
 
@@ -28,6 +29,7 @@ from sim_server.backends.gpu.device import DeviceLaunch, Gpu
 from sim_server.backends.gpu.energies import DeviceEnergies
 from sim_server.backends.gpu.factor_upload import FactorUpload
 from sim_server.backends.gpu.held import HeldForces, leading
+from sim_server.backends.gpu.helper import Helper
 from sim_server.backends.gpu.kernel_fusion import DOMAINS, Epilogue, FusedKernel, Prologue, fuse
 from sim_server.backends.gpu.known_patterns import KnownPatterns
 from sim_server.backends.gpu.loop import CAPACITY, GRAPH_STEPS, DeviceLoop
@@ -36,6 +38,8 @@ from sim_server.backends.gpu.measured import MeasuredReport
 from sim_server.backends.gpu.newton import NewtonIteration, NewtonPhases, begins_beside
 from sim_server.backends.gpu.pinned import pinned_array
 from sim_server.backends.gpu.rosenbrock import ATTEMPTS, RosenbrockStep
+from sim_server.backends.gpu.shared_device_memory import SharedDeviceMemory
+from sim_server.backends.gpu.smoothing import FactorSmoothing
 from sim_server.backends.gpu.solver import PCG_BODY, SETTINGS_BYTES, PcgSolver
 from sim_server.backends.gpu.splits import DeviceSplits, Staged
 from sim_server.backends.gpu.state import device_array, device_arrays
@@ -57,6 +61,8 @@ MOST_GRABS = 1024  # pushes and grabs at a time, of which forces are told
 MOST_TOLD = 16  # other bodies whose forces on a body are told, at most
 GRAB_BLOCKS, GRAB_THREADS = 32, 128  # of the kernel react (effects/touch.cu)
 PREPARED_WITHIN = 1.0  # s in which an inverse that is prepared for a check is begun, else the check goes without
+AT_A_TIME = 2  # factors of a body: one comes while the one before it is built
+MEMORY_AHEAD = 4 << 20, 256 << 20  # bytes of factors for which memory is taken before they come
 FEW = 16  # largest number of trials in a step without loops for which several steps are captured in one graph
 EPILOGUE = Declarations("backends/gpu/step_epilogue.cu")
 STEP_EPILOGUE = EPILOGUE.dtype("StepEpilogue")
@@ -91,6 +97,7 @@ class GpuEngine(DeviceLoop):
     capabilities: frozenset[Capability] = frozenset()
 
     def __init__(self, gpu: Gpu, given: EngineInput, records: int | None = None):
+        self._helper = Helper.wanted(gpu, given)
         assemble, integrate = (cast(Sequence[DeviceLaunch], part) for part in (given.assemble, given.integrate))
         self.launches, self._first = [*assemble, *integrate], assemble[: leading(assemble)]
         self._history = cast(Sequence[DeviceLaunch], given.history)
@@ -125,6 +132,7 @@ class GpuEngine(DeviceLoop):
         self._forces = fuse(forces) if alone else ()  # after a whole assembly, whose energy balance is made already
         phases = NewtonPhases.initial(gpu, bodies) if newton else None
         correction = self._correction = FactorCorrection.wanted(gpu, given)
+        self._smoothing = None if self._helper else FactorSmoothing.wanted(gpu, given)  # which has half of the inverse
         most_blocks = given.cut.most_blocks if given.cut else ()
         surfaces = given.contact.surfaces if given.contact else None
         self._rows_of_bodies: tuple[NDArray[Any], ...] = (
@@ -136,7 +144,7 @@ class GpuEngine(DeviceLoop):
             phases.of_solves(errors) if phases else (), ATTEMPTS if stages else 0,
             given.contact is not None,
             given.contact is not None and bool(given.contact.surfaces or given.contact.ties), correction, errors,
-            budgets, given.cut,
+            budgets, given.cut, self._smoothing, self._helper,
         )  # fmt: skip
         self._newton, newton_results = None, None
         if newton and phases:
@@ -231,6 +239,7 @@ class GpuEngine(DeviceLoop):
             self._integrate = FusedKernel(integrate, epilogue, opening=ending)
             self._stamp_begin = self._integrate.function("stamp_begin")
         self._known: Float64 = arrays["values"]  # as a factor is to know them
+        self._expected: dict[int, Future[None]] = {}  # memory for factors that will come, by pattern
         self._matrix = self._matrix_launches(assemble) if alone else ()
         self._capture()
         if given.touch is not None:
@@ -283,7 +292,8 @@ class GpuEngine(DeviceLoop):
 
     def state(self) -> list[StateArray]:
         """Returns what the device carries on beside the arrays that launches write."""
-        parts = (self._energies, self.stages, self._substeps, self._contact, self._correction, self._splits)
+        solves = self._correction, self._smoothing
+        parts = (self._energies, self.stages, self._substeps, self._contact, *solves, self._splits)
         clock = self.gpu.twin(self._arrays["clock"])
         found = [device_array("engine.clock", clock), *(a for part in parts if part for a in part.state())]
         if self._rows_of_bodies:
@@ -414,7 +424,11 @@ class GpuEngine(DeviceLoop):
         if self.stages:
             self.stages.launch()
         else:
+            if self._helper:
+                self._helper.begin()
             (self._newton or self._contact or self._substeps or self.solver).launch()
+            if self._helper:
+                self._helper.end()
             if self._held:
                 self._held.launch()
             assert self._integrate is not None
@@ -495,6 +509,10 @@ class GpuEngine(DeviceLoop):
 
         return applied
 
+    def may_prepare(self, body: int) -> bool:
+        """False while the factor before waits to be used, or steps under way still read the one that it replaced."""
+        return self._factor_upload.may_prepare(body)
+
     def drop_factor(self, body: int, factor: Factor) -> None:
         """Gives up a factor that may have been prepared, and is not posted."""
         self._factor_upload.drop(body, factor.values)
@@ -503,10 +521,27 @@ class GpuEngine(DeviceLoop):
         """Makes an array for values of a factor, from which the device copies them."""
         return pinned_array(self.gpu.cp, count, dtype)
 
+    def shared_memory(self) -> SharedDeviceMemory:
+        """Returns device memory that workers beside this process can open."""
+        return SharedDeviceMemory(self.gpu)
+
     def expect_factors(self, body: int, pattern: FactorPattern) -> None:
-        """Begins to plan the inverses of factors of a pattern that will come, beside the caller."""
+        """Begins to plan the inverses of factors of a pattern that will come, and to take memory for such factors,
+        beside the caller."""
         self._factor_upload.expect(body, pattern)
+        if pattern.id not in self._expected and MEMORY_AHEAD[0] <= 4 * pattern.nonzeros <= MEMORY_AHEAD[1]:
+            self._expected[pattern.id] = self.solver.beside(partial(self._take_memory, pattern.nonzeros))
         self._patterns.note(body, pattern)
+
+    def _take_memory(self, count: int) -> None:
+        """Has page-locked memory for factors of so many values in CuPy's pool, as many as are there at a time. While it
+        is made all calls to CUDA wait."""
+        together = [self.factor_memory(count, np.dtype(np.float32)) for _ in range(AT_A_TIME)]
+        del together
+
+    def expects_factors(self) -> bool:
+        """True once the inverses of all factors that are expected are planned, and their memory is there."""
+        return self.solver.plans_made and all(each.done() for each in self._expected.values())
 
     def resume_factor(self, body: int, pattern: FactorPattern, values: NDArray[Any], step: int) -> None:
         """Posts the factor that was in use when the state was saved."""

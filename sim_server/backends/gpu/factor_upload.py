@@ -20,14 +20,17 @@ from dataclasses import dataclass, field
 from functools import partial
 from typing import Any, NamedTuple
 
+import numpy as np
 from numpy.typing import NDArray
 
 from protocol.factor import FactorPattern
 from sim_server.arrays import Float64
 from sim_server.backends.compiler import CompileError
 from sim_server.backends.gpu.device import Gpu, no_memory_left
+from sim_server.backends.gpu.device_values import DeviceValues
 from sim_server.backends.gpu.inverse.apply_inverse import Applied
 from sim_server.backends.gpu.inverse.build_inverse import InverseBuilder, InverseStorage, PartitionedInverse
+from sim_server.backends.gpu.inverse.device_digits import LARGE, is_large
 from sim_server.backends.gpu.loop import DeviceLoop
 from sim_server.backends.gpu.mailbox import DeviceMailbox
 from sim_server.backends.gpu.solver import SETTINGS_BYTES, PcgSolver, PlannedInverse
@@ -35,9 +38,10 @@ from sim_server.backends.gpu.structs import Mail
 
 log = logging.getLogger(__name__)
 
-SMALL = 1 << 20  # bytes of a factor that is copied at once
+SMALL = LARGE  # bytes of a factor that is copied at once
 MANY = 4  # small factors that come together, from which on none is built at once
 TOGETHER = 64  # factors of one plan that are handed over together
+AHEAD = 2  # such batches beside the caller: one is built, the next is there; what waits otherwise may be replaced
 BUSY = 0.25  # share of dt that steps in real time take, up to which builds may have the whole device
 MAX_KINDS = 2  # of inverses of a body at a time; workers with different libraries send different patterns
 InverseKind = tuple[int, int]
@@ -67,6 +71,7 @@ class UploadedFactor(NamedTuple):
 class GivenFactor:
     """A factor that came. Its values do not change any more.
 
+    source: its values where the inverse is built from, once its digits are chosen
     r: vector that its inverse is to be applied to. None: to none
     applied: P^-1 r on its way; None: nobody applies it
     wanted: it is to be used; False: once it is posted
@@ -74,10 +79,11 @@ class GivenFactor:
     """
 
     pattern: FactorPattern
-    values: NDArray[Any]
+    values: NDArray[Any] | DeviceValues
     step: int
+    source: NDArray[Any] | DeviceValues | None = None
     r: Float64 | None = None
-    applied: "Future[Applied | None]" = field(default_factory=Future)
+    applied: "Future[Applied | None] | None" = None
     wanted: bool = True
     dropped: bool = False
 
@@ -88,8 +94,11 @@ class GivenFactor:
 
     def tell(self, applied: Applied | None) -> None:
         """Tells who waits for P^-1 r, if it is not told yet."""
-        with suppress(InvalidStateError):
-            self.applied.set_result(applied)
+        _tell(self.applied, applied)
+
+
+Work = tuple[int, GivenFactor, Mapping[InverseKind, InverseStorage | None]]
+"""A body, its factor, and by kind a storage that no step reads, if there is one."""
 
 
 class ChosenPlan(NamedTuple):
@@ -97,6 +106,7 @@ class ChosenPlan(NamedTuple):
 
     planes: float16 numbers per entry
     spare: a storage that no step reads; None: one is to be made
+    applied: P^-1 r on its way, if the factor is to be applied
     """
 
     body: int
@@ -104,6 +114,11 @@ class ChosenPlan(NamedTuple):
     planes: int
     plan: Future[PlannedInverse]
     spare: InverseStorage | None
+    applied: "Future[Applied | None] | None"
+
+    def tell(self, applied: Applied | None) -> None:
+        """Tells who waits for P^-1 r, if it is not told yet."""
+        _tell(self.applied, applied)
 
 
 class Builds(NamedTuple):
@@ -111,10 +126,12 @@ class Builds(NamedTuple):
 
     given: by body
     made: of each, in this order, or why there is none
+    together: they are some of many small ones
     """
 
     given: dict[int, GivenFactor]
     made: Future[list[UploadedFactor | Exception]]
+    together: bool
 
 
 @dataclass
@@ -173,7 +190,7 @@ class FactorUpload:
         planes = solver.planes or 1
         self._uploads = [BodyUploads(name, box, planes) for name, box in zip(names, mailboxes, strict=True)]
         self._lock = threading.RLock()
-        self._waiting: set[int] = set()  # bodies with a queued factor
+        self._waiting: dict[int, None] = {}  # bodies with a queued factor, those that wait longest first
         self._builds: list[Builds] = []  # under way beside the caller
         self._known: set[InverseKind] = set()  # of which storages were made
 
@@ -182,7 +199,7 @@ class FactorUpload:
         self._uploads[body].expected = pattern.id
         self._solver.begin_plan(body, pattern)
 
-    def post(self, body: int, pattern: FactorPattern, values: NDArray[Any], step: int) -> None:
+    def post(self, body: int, pattern: FactorPattern, values: NDArray[Any] | DeviceValues, step: int) -> None:
         """Takes a factor: begins to build its inverse now, or once a storage is free.
 
         Returns at once: what takes long, plans and large factors, is done beside the caller. The values must not change
@@ -195,18 +212,25 @@ class FactorUpload:
                 self._begin_queued([body])
 
     def prepare(
-        self, body: int, pattern: FactorPattern, values: NDArray[Any], step: int, r: Float64
+        self, body: int, pattern: FactorPattern, values: NDArray[Any] | DeviceValues, step: int, r: Float64
     ) -> "Future[Applied | None]":  # fmt: skip
         """Builds the inverse of a factor, beside the caller, and applies it to r (n,); it is used once these very
         values are posted. Returns P^-1 r; None as its result if it comes to nothing."""
-        given = GivenFactor(pattern, values, step, r, wanted=False)
+        applied: Future[Applied | None] = Future()
+        given = GivenFactor(pattern, values, step, r=r, applied=applied, wanted=False)
         with self._lock:
             self._refresh(body)
             self._enqueue(body, given)
             self._begin_queued([body], beside=True)
-        return given.applied
+        return applied
 
-    def drop(self, body: int, values: NDArray[Any]) -> None:
+    def may_prepare(self, body: int) -> bool:
+        """True if the inverse of another factor would be begun at once."""
+        with self._lock:
+            self._refresh(body)
+            return self._uploads[body].free and self._uploads[body].queued is None
+
+    def drop(self, body: int, values: NDArray[Any] | DeviceValues) -> None:
         """Gives up a factor that was prepared and not posted; any other one is let alone."""
         with self._lock:
             uploads = self._uploads[body]
@@ -221,14 +245,14 @@ class FactorUpload:
                 uploads.queued = None
             self._begin_queued([body])
 
-    def _prepared(self, body: int, values: NDArray[Any]) -> GivenFactor | None:
+    def _prepared(self, body: int, values: NDArray[Any] | DeviceValues) -> GivenFactor | None:
         """Returns the factor with these values that is prepared and not posted."""
         uploads = self._uploads[body]
         building = None if uploads.building is None else uploads.building.given[body]
         coming = (uploads.queued, building, None if uploads.built is None else uploads.built[1])
         return next((each for each in coming if each is not None and not each.wanted and each.values is values), None)
 
-    def _use_prepared(self, body: int, values: NDArray[Any]) -> bool:
+    def _use_prepared(self, body: int, values: NDArray[Any] | DeviceValues) -> bool:
         """Has a prepared factor used, at once if it is built; False if there is none with these values."""
         uploads = self._uploads[body]
         given = self._prepared(body, values)
@@ -250,17 +274,16 @@ class FactorUpload:
             uploads.built = None
         uploads.queued = given
 
-    def post_many(self, given: Sequence[tuple[int, FactorPattern, NDArray[Any], int]]) -> None:
+    def post_many(self, given: Sequence[tuple[int, FactorPattern, NDArray[Any] | DeviceValues, int]]) -> None:
         """Takes factors, each as `post` takes one; of several of a body the last one counts. Inverses of many are built
         beside the caller, who would wait for one after another, those of one plan together."""
         with self._lock:
             waiting: dict[int, None] = {}  # in this order
             for body, pattern, values, step in given:
-                self._refresh(body)
                 if not self._use_prepared(body, values):
                     self._enqueue(body, GivenFactor(pattern, values, step))
                     waiting[body] = None
-            self._begin_queued(list(waiting))
+            self._begin_queued([*self._waiting, *(body for body in waiting if body not in self._waiting)])
 
     def advance(self) -> None:
         """Posts what was built beside the caller, and begins the builds that have waited for a storage."""
@@ -268,10 +291,7 @@ class FactorUpload:
             for builds in [each for each in self._builds if each.made.done()]:
                 self._finish(builds)
             if self._waiting:
-                waiting = sorted(self._waiting)
-                for body in waiting:
-                    self._refresh(body)
-                self._begin_queued(waiting)
+                self._begin_queued(list(self._waiting))
 
     def settle(self) -> None:
         """Waits until the next step will use the newest factors. Only while the loop stands still."""
@@ -291,7 +311,7 @@ class FactorUpload:
                     uploads.posted = uploads.mail = None
                 self._refresh(body)
                 uploads.leaving = None
-                self._begin_queued([body])
+                self._begin_queued([body], now=True)
             if uploads.building is not None:
                 return uploads.building.made
             if uploads.posted is not None:
@@ -317,68 +337,100 @@ class FactorUpload:
         if uploads.leaving is not None and self._loop.step >= uploads.leaving[1]:
             uploads.leaving = None
 
-    def _begin_queued(self, bodies: Sequence[int], beside: bool = False) -> None:
+    def _begin_queued(self, bodies: Sequence[int], beside: bool = False, now: bool = False) -> None:
         """Begins to build the queued factors of some bodies that need not wait: at once if they are few, small and
-        planned and not `beside`, else in the thread of the plans."""
+        planned and not `beside`, else in the thread of the plans, to which no more are given than it is about to build:
+        what waits here is replaced by what is newer. now: none waits for builds of other bodies"""
         small: list[int] = []
+        together = sum(builds.together for builds in self._builds)
+        room, few = TOGETHER * (AHEAD - together), now or (len(bodies) < MANY and not together)
         for body in bodies:
             uploads = self._uploads[body]
-            if uploads.queued is None or not uploads.free:
-                (self._waiting.discard if uploads.queued is None else self._waiting.add)(body)
-            elif uploads.queued.values.nbytes > SMALL or beside:
+            if uploads.queued is None:
+                self._waiting.pop(body, None)
+                continue
+            large = uploads.queued.values.nbytes > SMALL or beside
+            full = not (large or few) and len(small) >= room
+            if not full:
+                self._refresh(body)
+            if full or not uploads.free:
+                self._waiting[body] = None
+            elif large:
                 self._begin_beside([body])
-            elif len(bodies) < MANY:
+            elif few:
                 self._begin_now(body)
             else:
                 small.append(body)
         for k in range(0, len(small), TOGETHER):
-            self._begin_beside(small[k : k + TOGETHER])
+            self._begin_beside(small[k : k + TOGETHER], together=True)
 
-    def _take_queued(self, body: int) -> tuple[int, GivenFactor, Mapping[InverseKind, InverseStorage | None]]:
+    def _take_queued(self, body: int) -> Work:
         """Takes the queued factor of a body, with the storages that no step reads."""
         uploads = self._uploads[body]
         given, uploads.queued = uploads.queued, None
         assert given is not None
-        self._waiting.discard(body)
+        self._waiting.pop(body, None)
         used = uploads.in_use.storage if uploads.in_use else None
         spare = {kind: next((s for s in made if s is not used), None) for kind, made in uploads.storages.items()}
         return body, given, spare
 
     def _begin_now(self, body: int) -> None:
-        chosen = self._chosen(*self._take_queued(body))
-        if chosen.plan.done():
-            self._post(body, chosen.given, self._build([chosen])[0])
+        work = self._take_queued(body)
+        chosen = self._chosen([work])
+        if chosen[0].plan.done():
+            self._post(body, chosen[0].given, self._build(chosen)[0])
         else:
-            builds = self._note([chosen.given], [body])
-            self._solver.beside(partial(self._end, [chosen], builds.made))
+            builds = self._note([work[1]], [body])
+            self._solver.beside(partial(self._end, chosen, builds.made))
 
-    def _begin_beside(self, bodies: Sequence[int]) -> None:
+    def _begin_beside(self, bodies: Sequence[int], together: bool = False) -> None:
         work = [self._take_queued(body) for body in bodies]
-        builds = self._note([given for _, given, _ in work], bodies)
+        builds = self._note([given for _, given, _ in work], bodies, together)
         self._solver.beside(partial(self._choose_and_build, work, builds.made))
 
-    def _note(self, given: Sequence[GivenFactor], bodies: Sequence[int]) -> Builds:
-        builds = Builds(dict(zip(bodies, given, strict=True)), Future())
+    def _note(self, given: Sequence[GivenFactor], bodies: Sequence[int], together: bool = False) -> Builds:
+        builds = Builds(dict(zip(bodies, given, strict=True)), Future(), together)
         for body in bodies:
             self._uploads[body].building = builds
         self._builds.append(builds)
         return builds
 
-    def _chosen(
-        self, body: int, given: GivenFactor, spare: Mapping[InverseKind, InverseStorage | None]
-    ) -> ChosenPlan:  # fmt: skip
-        """Chooses how many digits an inverse needs, and begins its plan."""
-        planes = self._solver.planes_for(given.pattern, given.values)
-        plan = self._solver.begin_plan(body, given.pattern, planes)
-        return ChosenPlan(body, given, planes, plan, spare.get((given.pattern.id, planes)))
+    def _chosen(self, work: Sequence[Work], planes: int = 0) -> list[ChosenPlan]:
+        """Chooses how many digits each of some inverses needs, and begins its plan. planes: as many as these; 0: not
+        known yet"""
+        own = [planes] * len(work) if planes else self._planes_of([given for _, given, _ in work])
+        chosen = []
+        for (body, given, spare), needed in zip(work, own, strict=True):
+            plan = self._solver.begin_plan(body, given.pattern, needed)
+            spare_one = spare.get((given.pattern.id, needed))
+            chosen.append(ChosenPlan(body, given, needed, plan, spare_one, given.applied))
+        return chosen
 
-    def _choose_and_build(
-        self, work: Sequence[tuple[int, GivenFactor, Mapping[InverseKind, InverseStorage | None]]],
-        made: Future[list[UploadedFactor | Exception]],
-    ) -> None:  # fmt: skip
+    def _planes_of(self, given: Sequence[GivenFactor]) -> list[int]:
+        """Returns the float16 numbers per entry that the inverse of each of some factors needs."""
+        sources = [self._source(each) for each in given]
+        if len(given) == 1 and isinstance(sources[0], DeviceValues):
+            return [self._solver.planes_on_device(given[0].pattern, sources[0], self._multiprocessors)]
+        return self._solver.planes_of([(g.pattern, np.asarray(s)) for g, s in zip(given, sources, strict=True)])
+
+    def _source(self, given: GivenFactor) -> NDArray[Any] | DeviceValues:
+        """Returns values of a factor as its inverse is built from them: large ones are brought to the device first if
+        their digits are to be chosen."""
+        if given.source is None:
+            large = is_large(given.values) and self._solver.planes is None
+            given.source = self._solver.brought(given.values) if large else given.values
+        return given.source
+
+    def _choose_and_build(self, work: Sequence[Work], made: Future[list[UploadedFactor | Exception]]) -> None:
         """Begins to build inverses, in the thread of the plans: now, or behind their plans."""
+        planes = 0
         try:
-            chosen = [self._chosen(*each) for each in work]
+            if len(work) == 1 and self._solver.planes is None:
+                planes, built = self._built_ahead(*work[0])
+                if built is not None:
+                    made.set_result([built])
+                    return
+            chosen = self._chosen(work, planes)
         except Exception as error:
             for _, given, _ in work:
                 given.tell(None)
@@ -388,6 +440,24 @@ class FactorUpload:
             self._end(chosen, made)
         else:
             self._solver.beside(partial(self._end, chosen, made))
+
+    def _built_ahead(
+        self, body: int, given: GivenFactor, spare: Mapping[InverseKind, InverseStorage | None]
+    ) -> tuple[int, UploadedFactor | Exception | None]:  # fmt: skip
+        """Begins to build an inverse with as many digits as the one before had, and finds out meanwhile how many it
+        needs. Returns the float16 numbers per entry that it needs, and what is made; None: it needs others."""
+        expected = self._uploads[body].planes
+        plan, applied, built = self._solver.begin_plan(body, given.pattern, expected), Future[Applied | None](), None
+        if plan.done():
+            spare_one = spare.get((given.pattern.id, expected))
+            built = self._build([ChosenPlan(body, given, expected, plan, spare_one, applied)])[0]
+        planes = self._planes_of([given])[0]
+        if built is not None and planes == expected:
+            given.tell(applied.result())
+            return planes, built
+        if isinstance(built, UploadedFactor):
+            built.inverse.event.synchronize()  # the device writes into memory that nobody keeps
+        return planes, None
 
     def _end(self, chosen: Sequence[ChosenPlan], made: Future[list[UploadedFactor | Exception]]) -> None:
         try:
@@ -409,7 +479,7 @@ class FactorUpload:
                             made[place] = error
         finally:
             for each in chosen:
-                each.given.tell(None)
+                each.tell(None)
         return made
 
     def _build_by(
@@ -418,10 +488,14 @@ class FactorUpload:
     ) -> None:  # fmt: skip
         """Fills in what is made at some places, each in a storage, a new one unless there is one to spare."""
         storages: dict[int, InverseStorage] = {}  # by place
+        made_new = iter(self._new_storages(planned.builder, sum(chosen[place].spare is None for place in places)))
         for place in places:
             try:
-                spare = chosen[place].spare
-                storage = planned.builder.storage() if spare is None else spare
+                storage = chosen[place].spare
+                if storage is None:
+                    storage = next(made_new, None)
+                if storage is None:
+                    storage = planned.builder.storage()
                 self._solver.reserve_vectors(chosen[place].body, planned.plan)
                 storages[place] = storage
             except Exception as error:
@@ -430,7 +504,7 @@ class FactorUpload:
         builder, able, multiprocessors = planned.builder, list(storages), self._multiprocessors
         for k in range(0, len(able), builder.most):
             some = able[k : k + builder.most]
-            values = [chosen[place].given.values for place in some]
+            values = [self._source(chosen[place].given) for place in some]
             inverses = builder.build_many(values, [storages[place] for place in some], multiprocessors)
             for place, inverse in zip(some, inverses, strict=True):
                 given, planes = chosen[place].given, chosen[place].planes
@@ -438,13 +512,24 @@ class FactorUpload:
             for place, inverse in zip(some, inverses, strict=True):
                 self._apply(builder, inverse, chosen[place])
 
+    def _new_storages(self, builder: InverseBuilder, count: int) -> list[InverseStorage]:
+        """Makes storages for several inverses at once; none where they are few, or there is too little memory."""
+        if count < MANY:
+            return []
+        try:
+            return builder.several_storages(count)
+        except Exception as error:
+            if not no_memory_left(error):
+                raise
+            return []
+
     def _apply(self, builder: InverseBuilder, inverse: PartitionedInverse, chosen: ChosenPlan) -> None:
         """Begins to apply an inverse for the check of its factor, which goes without where that cannot be done: the
         inverse is there all the same, and the device writes into its storage."""
         if chosen.given.r is None or chosen.given.dropped:  # dropped: nobody would keep the memory that it comes to
             return
         try:
-            chosen.given.tell(builder.apply(inverse, chosen.given.r, self._multiprocessors))
+            chosen.tell(builder.apply(inverse, chosen.given.r, self._multiprocessors))
         except Exception as error:
             log.warning("object %r: a factor is not applied for its check: %s", self._uploads[chosen.body].name, error)
 
@@ -532,3 +617,9 @@ class FactorUpload:
             log.warning(
                 "object %r: a factor cannot be used on the GPU: %s; it goes on with %s", uploads.name, reason, held
             )
+
+
+def _tell(waiting: "Future[Applied | None] | None", applied: Applied | None) -> None:
+    if waiting is not None:
+        with suppress(InvalidStateError):
+            waiting.set_result(applied)

@@ -346,7 +346,6 @@ extern "C" __global__ void __launch_bounds__(CONTACT_THREADS) island_decide(cons
             a.coarse_well[island] = 1;
             atomicAdd(&a.tally->iterating, 1);
         }
-        if (s.phase == ISLAND_ENDED && s.residual > a.c.tolerance && s.status == CONVERGED) s.status = CONTACT;
     }
     a.state[island] = s;
 }

@@ -332,14 +332,17 @@ Mail* wf_gpu_post(GpuLoop* loop, MailSlot* slot, Mail* mail) {
     return before;
 }
 
-// Starts the balance of a body. sums: kinetic and potential energy [J], largest difference of dt v [m], diagonal [m].
-void wf_gpu_start_balance(Balance* balance, const double* sums, double dt, int32_t inertia) {
-    Sums s = no_sums();
-    s.kinetic = sums[0];
-    s.gravity = sums[1];
-    s.low[0] = 0;
-    s.high[0] = sums[2];
-    start_balance(*balance, s, sums[3], dt, inertia);
+// Starts the balances of some bodies. sums: of each body kinetic and potential energy [J], largest difference of dt v [m], diagonal [m].
+void wf_gpu_start_balances(int64_t count, const int64_t* bodies, Balance* balance, const double* sums, double dt, int32_t inertia) {
+    for (int64_t k = 0; k < count; ++k) {
+        const double* own = sums + 4 * bodies[k];
+        Sums s = no_sums();
+        s.kinetic = own[0];
+        s.gravity = own[1];
+        s.low[0] = 0;
+        s.high[0] = own[2];
+        start_balance(balance[bodies[k]], s, own[3], dt, inertia);
+    }
 }
 
 const StructSize* wf_sizes() {

@@ -11,7 +11,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from sim_server.arrays import Float64
+from sim_server.arrays import Float64, Int64
 from sim_server.backends.gpu import structs
 from sim_server.backends.gpu.mailbox import DeviceMailbox, library
 from sim_server.backends.gpu.structs import FRAME_COPIES, RECORD_TARGET
@@ -24,6 +24,7 @@ GRAPH_STEPS = (1, 2, 8)  # of which there are graphs
 CAPACITY = 64  # steps whose results are kept; more than can be under way
 FRAMES = 8  # in the ring
 BATCH_SECONDS = 2e-3  # aim for the duration of a batch [s]; requests wait for two batches at most
+DOUBLED = 512 << 20  # bytes of the matrices of all bodies, up to which each has two places for copies
 POLL = 1e-5  # interval between queries of an event [s]
 
 
@@ -101,7 +102,9 @@ class DeviceLoop(Reports):
         self._readbacks, block = (structs.BodyReadback * bodies)(), 9 * np.dtype(real).itemsize
         most = most_blocks or [int(row_start[last] - row_start[first]) for first, last in ranges]
         self._room = [block * count for count in most]  # bytes of the blocks of each body at most
-        staged = np.cumsum([0, *self._room])
+        self._places = sum(self._room) <= DOUBLED  # two for the copies of each body
+        staged = np.cumsum([0, *((1 + self._places) * room for room in self._room)])
+        self._staged_begin = [int(begin) for begin in staged]  # of the first one of each
         for entry, (first, last), own in zip(self._readbacks, ranges, staged, strict=False):
             begin, end = block * int(row_start[first]), block * int(row_start[last])
             entry.values_begin, entry.values_bytes, entry.copied_step = begin, end - begin, -1
@@ -109,7 +112,9 @@ class DeviceLoop(Reports):
             entry.x_begin, entry.x_bytes = (3 * np.dtype(real).itemsize * k for k in (first, last - first))
         self._real, self._value_bytes = np.dtype(real), int(staged[-1])
         self._targets: dict[int, Float64] = {}
-        self._requested_bytes: dict[int, int] = {}  # by body
+        self._own_memory: dict[int, Float64] = {}  # by its place
+        entries = np.ctypeslib.as_array(self._readbacks)
+        self._copied_steps, self._requests = entries["copied_step"], entries["requested"]
         loop.driver = c.addressof(device.functions)
         loop.context, loop.stream, loop.copy_stream = device.context, device.stream, device.copies
         loop.mail_slots, loop.mail_slot_count = c.addressof(self._slots), len(mailboxes)
@@ -250,23 +255,61 @@ class DeviceLoop(Reports):
             raise ValueError(f"positions of a GPU are copied as they are, not {ahead:g} s ahead")
         self._request(body, target, structs.REQUEST_POSITIONS)
 
-    def _request(self, body: int, target: Float64, request: int) -> None:
-        if not self.loop.staged:  # allocated at the first request
+    def copy_memory(self, body: int) -> Float64 | None:
+        """Returns page-locked memory that the next copy of a body's matrix is brought to, (blocks, 3, 3), and that the
+        one behind it leaves alone; None: where matrices are large, or of another type."""
+        if self._real != np.float64 or not self._places:
+            return None
+        begin = self._staged_begin[body]
+        place = begin + self._room[body] if self._readbacks[body].staged_begin == begin else begin
+        if place not in self._own_memory:
+            memory = self._staging()[place : place + self._room[body]]
+            self._own_memory[place] = memory.view(np.float64).reshape(-1, 3, 3)
+        return self._own_memory[place]
+
+    def prepare_copies(self) -> None:
+        """Makes the memory of copies, which is page-locked: while it is made all calls to CUDA wait."""
+        self._staging()
+
+    def _staging(self) -> NDArray[Any]:
+        """Returns the page-locked memory of copies, made at the first request at the latest."""
+        if not self.loop.staged:
             self.loop.staged = self._device.memory(self._value_bytes)
             self._pinned_values = self._device.pinned(self._value_bytes)
             self.loop.host_matrices = self._pinned_values.ctypes.data
-        self._targets[body] = target
-        entry = self._readbacks[body]
-        entry.copied_step, entry.requested = -1, request
-        self._requested_bytes[body] = self._room[body] if request == structs.REQUEST_VALUES else entry.x_bytes
+        return self._pinned_values
+
+    def _request(self, body: int, target: Float64, request: int) -> None:
+        self._staging()
+        if target is not self.copy_memory(body):
+            self._targets[body] = target
+        entry, begin = self._readbacks[body], self._staged_begin[body]
+        if self._places:  # the other one: who has the copy before this one may still read it
+            entry.staged_begin = begin + self._room[body] if entry.staged_begin == begin else begin
+        self._copied_steps[body] = -1
+        self._requests[body] = request  # last: from then on the loop copies
         self.loop.requested = 1
 
     def matrix_step(self, body: int) -> int:
         """Returns the step (steps completed before) of the copy requested last, -1 until it is complete."""
-        entry = self._readbacks[body]
-        step = int(entry.copied_step)
+        step = int(self._copied_steps[body])
         if step >= 0 and body in self._targets:
-            data = self._pinned_values[entry.staged_begin : entry.staged_begin + self._requested_bytes[body]]
-            target = self._targets.pop(body)
+            entry, target = self._readbacks[body], self._targets.pop(body)
+            data = self._pinned_values[entry.staged_begin :][: target.size * self._real.itemsize]
             target[...] = data.view(self._real).reshape(target.shape)
         return step
+
+    def matrix_steps(self, bodies: Sequence[int]) -> Int64:
+        """Returns the same of each of some bodies."""
+        if not self._targets:
+            steps: Int64 = self._copied_steps[list(bodies)]
+            return steps
+        return np.array([self.matrix_step(body) for body in bodies], np.int64)
+
+    def staged_matrix(self, body: int) -> int:
+        """Returns the device address of the copy requested last, once it is complete: the same float64 values
+        (blocks, 3, 3), until the next request. 0: there is none."""
+        entry = self._readbacks[body]
+        if not self.loop.staged or entry.copied_step < 0 or self._real != np.float64:
+            return 0
+        return int(self.loop.staged) + int(entry.staged_begin)

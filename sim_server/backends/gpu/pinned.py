@@ -1,10 +1,13 @@
 # SPDX-License-Identifier: MIT
 """Arrays in page-locked host memory, which the device reads by itself, beside other work."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+from sim_server.backends.gpu.device_values import DeviceValues
 
 
 class PinnedArray(np.ndarray):
@@ -27,3 +30,25 @@ def pinned_array(cp: Any, count: int, dtype: np.dtype[Any]) -> NDArray[Any]:
         return np.empty(count, dtype)
     array: NDArray[Any] = np.frombuffer(memory, dtype, count).view(PinnedArray)
     return array
+
+
+def is_pinned(array: NDArray[Any] | DeviceValues) -> bool:
+    """True if the device can read an array, all of it together, by itself: it may be there already."""
+    return isinstance(array, DeviceValues) or (isinstance(array, PinnedArray) and array.flags.c_contiguous)
+
+
+def runs(arrays: Sequence[NDArray[Any] | DeviceValues]) -> list[tuple[int, int, int]]:
+    """Returns the copies that put arrays one behind the other, one for arrays that lie so already: first byte of the
+    target, address of the source, bytes."""
+    found: list[tuple[int, int, int]] = []
+    begin = 0
+    for each in arrays:
+        address = each.address if isinstance(each, DeviceValues) else int(each.__array_interface__["data"][0])
+        size = each.nbytes
+        if found and found[-1][1] + found[-1][2] == address:
+            first, source, length = found[-1]
+            found[-1] = first, source, length + size
+        else:
+            found.append((begin, address, size))
+        begin += size
+    return found

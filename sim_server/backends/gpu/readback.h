@@ -49,6 +49,7 @@ static void publish_matrices(GpuLoop& l) {
             l.readbacks[i].copied_step.store(l.matrix_step, std::memory_order_release);
         }
     l.matrix_step = -1;
+    wake(l.rings);
 }
 
 // Publishes the copies that have arrived, without waiting.

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sim_server.arrays import Float64
-from sim_server.updates.body_state import BodyUpdateState
+from sim_server.updates.body_state import BodyUpdateState, on_sent
 from sim_server.updates.factor_source import Job
 from sim_server.updates.policies.base import UpdatePolicy
 from sim_server.updates.prefetch import PrefetchDepth
@@ -22,10 +22,12 @@ from sim_server.updates.scheduler import (
     overdue_after,
     pick,
 )
+from sim_server.updates.update_table import NONE
 
 if TYPE_CHECKING:
     from sim_server.updates.driver import Driver
 
+FLYING_WEIGHT = 0.02  # of the jobs that are on their way now, in their running mean
 MAX_REQUESTS = 64  # matrices that the loop may be asked to copy within one step
 
 
@@ -33,6 +35,7 @@ class Async(UpdatePolicy):
     """Matrices of the most urgent bodies go to idle workers, one of a body at a time."""
 
     free = True
+    goes_ahead = True  # the next matrix of a body is sent while its last factor is checked, if there is room
 
     def __init__(self, driver: Driver, n: int = 0):
         super().__init__(driver, n)
@@ -40,6 +43,7 @@ class Async(UpdatePolicy):
         self._exhausted = -1  # step at which no body was left to be asked for its matrix
         self._newest_copy = -1  # that is there: number of its request
         self._choice_due = 0.0  # s; time before which `pump` chooses no bodies
+        self._on_their_way = 0.0  # jobs, about, from matrix to factor
 
     def step(self) -> None:
         """Makes a step after an exchange with the workers."""
@@ -72,6 +76,9 @@ class Async(UpdatePolicy):
             driver.by_name[name].on_reassignment()
             self.on_job_end()
         self._send_copies()
+        table = driver.table
+        count = int(np.count_nonzero(table.in_flight | (table.checked != NONE)))
+        self._on_their_way += FLYING_WEIGHT * (count - self._on_their_way)
 
     def _choose(self) -> None:
         """Requests the matrices of the most urgent bodies."""
@@ -83,10 +90,14 @@ class Async(UpdatePolicy):
         if places <= 0 or step == self._exhausted:
             return
         # Choose the most urgent bodies, and leave the first of them to faster workers that are busy
-        requests = self._requests()
-        requests = requests.of(self.wants(requests, step))
-        left, interval = source.faster_busy_workers(), solver.update_floor_steps
-        chosen = pick(requests, left + places, interval, solver.schedule, self._overdue(source.worker_count()))[left:]
+        left, overdue = source.faster_busy_workers(), self._overdue(self._jobs())
+        chosen: list[int] = []
+        for ahead in (False, True) if self.goes_ahead else (False,):
+            if room := left + places - len(chosen):
+                requests = self._requests(ahead)
+                requests = requests.of(self.wants(requests, step))
+                chosen += pick(requests, room, solver.update_floor_steps, solver.schedule, overdue)
+        chosen = chosen[left:]
         # Request their matrices; in advance only those of bodies that need a factor
         states = [driver.bodies[body] for body in chosen]
         wanted = states[:idle] + [s for s in states[idle:] if s.job.sent is None or s.solves.excess > 0]
@@ -103,16 +114,16 @@ class Async(UpdatePolicy):
         """Returns a bound by the latencies measured so far."""
         if np.isnan(self.driver.table.latency).all():
             return -1
-        workers = self.driver.source.worker_count()  # asked once: one may join or leave at any time
-        return max_factor_age(self._overdue(workers), self._latencies(), workers)
+        jobs = self._jobs()  # asked once: a worker may join or leave at any time
+        return max_factor_age(self._overdue(jobs), self._latencies(), jobs)
 
     def on_job_end(self) -> None:
         """Takes note that there is a body again whose matrix may be requested."""
         self._exhausted = -1
 
-    def _requests(self) -> UpdateRequests:
-        """Returns the requests of all bodies but frozen ones and those that are better left for a busy worker."""
-        requests, source = self.driver.requests(), self.driver.source
+    def _requests(self, ahead: bool) -> UpdateRequests:
+        """Returns the requests (Driver.requests) of bodies, without those that are better left for a busy worker."""
+        requests, source = self.driver.requests(ahead), self.driver.source
         failures = source.consecutive_failures()
         if failures is None:
             return requests
@@ -127,15 +138,14 @@ class Async(UpdatePolicy):
         """Sends copies to idle workers in the order of the requests. With a prefetch depth others wait their turn."""
         driver = self.driver
         copied = driver.snapshots.completed()
-        if copied and copied[-1].job.request > self._newest_copy:
-            self._newest_copy = copied[-1].job.request
-            self.prefetch.on_copy(time.monotonic() - copied[-1].job.requested)
-        idle = driver.source.ready() if copied else 0
+        if copied and (newest := copied[-1][0].job).request > self._newest_copy:
+            self._newest_copy = newest.request
+            self.prefetch.on_copy(time.monotonic() - newest.requested)
+        idle, now = driver.source.ready() if copied else 0, driver.engine.step
         made: list[tuple[BodyUpdateState, Job]] = []
-        for state in copied:
-            waited = driver.engine.step - driver.snapshots.step(state)
+        for state, step in copied:
             if idle <= len(made) and self.prefetch.depth:
-                if waited > self.prefetch.patience:
+                if now - step > self.prefetch.patience:
                     driver.snapshots.discard(state)
                 continue
             if (job := driver.make_job(state)) is not None:
@@ -143,16 +153,25 @@ class Async(UpdatePolicy):
         self.prefetch.on_sent(len(made), time.monotonic())
         if not made:
             return
+        sent: list[tuple[int, int]] = []
         for (state, job), taken in zip(made, driver.source.submit_many([job for _, job in made]), strict=True):
             if taken:
-                state.on_sent(job.step)
+                state.job.on_sent(job.step)
+                sent.append((state.body.index, job.step))
             else:
                 driver.snapshots.discard(state)
+        if sent:
+            on_sent(driver.table, *zip(*sent, strict=True))
 
-    def _overdue(self, workers: int) -> float:
+    def _jobs(self) -> float:
+        """Number of jobs on their way at a time, one at each worker at least; 0 without workers."""
+        workers = self.driver.source.worker_count()
+        return max(workers, self._on_their_way) if workers else 0
+
+    def _overdue(self, jobs: float) -> float:
         """Returns the steps after which a body goes next whatever the rule; inf without workers."""
         solver = self.driver.solver
-        return max(overdue_after(solver.schedule_rounds, self._latencies(), workers), solver.update_floor_steps)
+        return max(overdue_after(solver.schedule_rounds, self._latencies(), jobs), solver.update_floor_steps)
 
     def _latencies(self) -> Float64:
         """Returns the steps from matrix to factor of each body; those not known yet are the mean of the others."""
@@ -165,6 +184,8 @@ class Async(UpdatePolicy):
 
 class Adaptive(Async):
     """As Async, but a matrix is sent only once the excess iterations have cost as much as a factorization."""
+
+    goes_ahead = False  # what was lost is lost to the factor that is about to be replaced
 
     def wants(self, requests: UpdateRequests, step: int) -> Flags:
         """True where a new factor is worth its time (scheduler.is_worthwhile)."""

@@ -11,7 +11,10 @@ OURS = {"us p50": ("factor", "C0"), "CG us": ("CG", "C1"), "block Jacobi us": ("
 
 
 def figure(report: Report, single: list[Row], others: list[Row]) -> None:
-    """single: rows of one beam; others: rows of others' solvers."""
+    """single: rows of one beam, of which those of the card with most are drawn; others: rows of others' solvers."""
+    cards = [row["gpu"] for row in single]
+    card = max(cards, key=cards.count)
+    single, others = ([row for row in rows if row["gpu"] == card] for rows in (single, others))
     drawing, axes = plots().subplots(figsize=(7.5, 5), layout="constrained")
 
     def line(points: list[tuple[float, float | None]], style: str, label: str, **more: Any) -> None:
@@ -28,6 +31,6 @@ def figure(report: Report, single: list[Row], others: list[Row]) -> None:
     aims = [(tets, aim) for (beams, tets), aim in AIMS.items() if beams == 1]
     line([(tets, aim.aim) for tets, aim in aims], "k:", "aim, homogeneous")
     line([(tets, aim.paper) for tets, aim in aims], "k^", "Courtecuisse et al. 2010, GTX 480")
-    axes.set(xlabel="tetrahedra", ylabel="us per step")
+    axes.set(xlabel="tetrahedra", ylabel=f"us per step, {card}")
     axes.legend(fontsize=8)
     report.figure(drawing, "gpu.png", "Median time of a step against size")

@@ -2,12 +2,14 @@
 """How long a server on a GPU goes without a factor, how old factors are later, and how long clients wait for answers.
 
 A server of its own runs a beam in real time with one worker on the same GPU. A client asks for a status all the time
-from when the server answers a command for the first time. Kernels and orders of elimination are in their caches if an
-earlier run has put them there. A short time step tells more closely after what time a factor is in use.
+from when the server answers a command for the first time. Kernels, orders of elimination and patterns of factors are in
+their caches if an earlier run has put them there: `new in caches` tells how many files this run has made. A short time
+step tells more closely after what time a factor is in use.
 """
 
 import argparse
 import json
+import os
 import subprocess
 import sys
 import tempfile
@@ -32,35 +34,54 @@ Row = dict[str, Any]
 def measure(
     tets: int, first: str = "go", device: str = "gpu", worker: str = "gpu", seconds: float = 10.0, dt: float = 0.03
 ) -> Row:  # fmt: skip
-    """Runs a server for some seconds after its first answer, in real time.
+    """Runs a server for some seconds after its first answer, in real time; at least half of them with a factor.
 
-    first: solver.first_factor. Returns: steps and seconds until a step used a factor; of the status queries the number,
-    how many failed, and the longest [ms]; of the factors in the last half their number a second, mean age [steps] and
-    time from the step of the matrix to the first step that uses it [ms]; times of the steps in that half [ms]
+    first: solver.first_factor. Returns: files that were new in the caches; seconds from the start of the process to the
+    first answer; steps and seconds until a step used a factor; of the status queries the number, how many failed, and
+    the longest [ms]; of the factors in the last half their number a second, mean age [steps] and time from the step of
+    the matrix to the first step that uses it [ms]; times of the steps in that half [ms];
+    matrices and factors that stayed in memory of the device
     """
     with tempfile.TemporaryDirectory() as folder:
-        scene, endpoint = Problem(tets, dt=dt).write(Path(folder)), free_endpoint()
-        server = subprocess.Popen(
-            [sys.executable, "-m", "sim_server", str(scene), "--device", device, "--realtime", "--workers", "1",
-             "--worker-device", worker, "--listen", endpoint, "--set", f"solver.first_factor={first}"],
-            stdout=sys.stderr,
-        )  # fmt: skip
-        try:
-            return {"tets": tets, "worker": worker, "dt": dt, "first factor": first, **_watched(endpoint, seconds, dt)}
-        finally:
-            server.terminate()
-            server.wait(30)
+        scene = Problem(tets, dt=dt).write(Path(folder))
+        row = served(scene, first, device, worker, seconds, dt)
+    return {"tets": tets, "worker": worker, "dt": dt, "first factor": first, **row}
 
 
-def _watched(endpoint: str, seconds: float, dt: float) -> Row:
-    client = _client(endpoint)
+def served(scene: Path, first: str, device: str, worker: str, seconds: float, dt: float) -> Row:
+    """The same for a scene of one body in a file. first: "" for servers that know no other than to go."""
+    endpoint, chosen = free_endpoint(), ["--set", f"solver.first_factor={first}"] if first else []
+    kept, started = _kept(), time.monotonic()
+    server = subprocess.Popen(
+        [sys.executable, "-m", "sim_server", str(scene), "--device", device, "--realtime", "--workers", "1",
+         "--worker-device", worker, "--listen", endpoint, *chosen],
+        stdout=sys.stderr,
+    )  # fmt: skip
+    try:
+        row = _watched(endpoint, seconds, dt, started)
+        return {"new in caches": len(_kept() - kept), **row}
+    finally:
+        server.terminate()
+        server.wait(30)
+
+
+def _kept() -> set[Path]:
+    """Returns the files in the caches of compiled kernels, orders and patterns, of a checkout of any commit."""
+    home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    ours = Path(os.environ.get("WARPFACTOR_CACHE") or home / "warpfactor")
+    kernels = Path(os.environ.get("CUPY_CACHE_DIR") or Path.home() / ".cupy" / "kernel_cache")
+    return {path for folder in (ours, kernels) for path in folder.rglob("*") if path.is_file()}
+
+
+def _watched(endpoint: str, seconds: float, dt: float, started: float) -> Row:
+    client = client_of(endpoint)
     with client:
-        _answering(client)
+        answering(client)
         begun, used, waits, failed = time.monotonic(), None, [], 0
         half = begun + seconds / 2
         subscribed, steps = client.steps(), list[pb.ObjectStep]()
         step_of_use = -1
-        while (now := time.monotonic()) < begun + seconds or (used is None and now < begun + PATIENCE):
+        while (now := time.monotonic()) < begun + (PATIENCE if used is None else max(seconds, used + seconds / 2)):
             try:
                 client.command("status")
                 status = client.status()
@@ -77,9 +98,11 @@ def _watched(endpoint: str, seconds: float, dt: float) -> Row:
             time.sleep(0.005)
         milliseconds = 1e3 * np.array(waits)
         return {
+            "answers after s": begun - started,
             "in use s": used, "in use step": step_of_use, "queries": len(waits), "failed": failed,
             "answer ms p50": float(np.percentile(milliseconds, 50)), "answer ms max": float(milliseconds.max()),
             **_of_steps(steps, dt), "late steps": int(status.late_steps),
+            "arrays on device": int(getattr(status, "bulk_on_device", 0)),  # 0 of older checkouts
         }  # fmt: skip
 
 
@@ -99,7 +122,7 @@ def _of_steps(steps: Sequence[pb.ObjectStep], dt: float) -> Row:
     }  # fmt: skip
 
 
-def _answering(client: Client) -> None:
+def answering(client: Client) -> None:
     """Waits until the server answers commands: until then it has not begun."""
     end = time.monotonic() + PATIENCE
     while True:
@@ -111,7 +134,8 @@ def _answering(client: Client) -> None:
                 raise
 
 
-def _client(endpoint: str) -> Client:
+def client_of(endpoint: str) -> Client:
+    """Connects to a server that may still be starting."""
     end = time.monotonic() + PATIENCE
     while True:
         try:

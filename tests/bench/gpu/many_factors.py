@@ -17,27 +17,37 @@ from tests.bench.gpu.problem import Problem
 from tests.bench.gpu.served import Served
 
 Row = dict[str, Any]
+PATIENCE = 120.0  # s for the first factor
 
 
-def measure(beams: int, tets: int, device: str, worker: str, first: float, seconds: float) -> Row:
-    """Measures for `seconds` after all beams have had two factors, or `first` seconds at most: when all have had one,
-    some of these are old, as they waited for the others."""
+def measure(
+    beams: int, tets: int, device: str, worker: str, first: float, seconds: float, schedule: str = "excess"
+) -> Row:  # fmt: skip
+    """Measures for `seconds`, from when all beams use their second factor: some of the first ones are old, as they
+    waited for the others. Begins `first` seconds at most after a first factor came, for which a worker on a GPU may
+    compile its kernels, as the server does those that build inverses."""
     with tempfile.TemporaryDirectory() as folder:
-        sim = Simulation.load(Problem(tets, beams=beams).write(Path(folder)), device=device)
+        scene = Problem(tets, beams=beams).write(Path(folder))
+        sim = Simulation.load(scene, [f"solver.schedule={schedule}"], device=device)
     with Served(sim, worker) as served:
         driver, adopted, cpu = served.driver, [0], 0.0
-        used_factors = driver.table.used
         for body in sim.world.bodies[1:]:
             served.link.announce(messages.topology(sim, body))
         driver.on_adopt.append(lambda factor: adopted.__setitem__(0, adopted[0] + 1))
-        begun = time.monotonic()
+        begun, came = time.monotonic(), float("nan")
+        used, uses = np.full(beams, -1), np.zeros(beams, int)  # step of the factor in use, and how many were
         ready = float("nan")
-        while used_factors.min() < 2 and time.monotonic() < begun + first:
-            driver.pump()
+        while uses.min() < 2 and time.monotonic() < (came + first if came == came else begun + PATIENCE):
+            r = driver.pump()
             time.sleep(ROUND_PERIOD)
-            if used_factors.min() and ready != ready:
-                ready = time.monotonic() - begun
-        without = int((used_factors == 0).sum())
+            if adopted[0] and came != came:
+                came = time.monotonic()
+            for body, step in zip(*np.unique(np.stack([r["body"], r["factor_step"]]), axis=1), strict=True):
+                uses[body] += step > used[body]
+                used[body] = max(used[body], step)
+            if uses.min() and ready != ready:
+                ready = time.monotonic() - came
+        without = int((uses == 0).sum())
         end, records, count = time.monotonic() + seconds, [], adopted[0]
         while time.monotonic() < end:
             busy = time.thread_time()
@@ -47,12 +57,15 @@ def measure(beams: int, tets: int, device: str, worker: str, first: float, secon
             time.sleep(ROUND_PERIOD)
         count = adopted[0] - count
         r = np.concatenate(records)
-    used = r[r["factor_step"] >= 0]
-    age = used["step"] - 1 - used["factor_step"]
+    own = r[r["factor_step"] >= 0]
+    age = own["step"] - 1 - own["factor_step"]
+    taken_up = len(np.unique(np.stack([own["body"], own["factor_step"]]), axis=1).T) - len(np.unique(own["body"]))
     steps = len(r) / beams
     return {
-        "beams": beams, "tets": tets, "worker": worker, "all have one after s": ready, "without": without,
-        "factors/s": count / seconds, "service us/factor": 1e6 * cpu / max(count, 1), "steps/s": steps / seconds,
+        "beams": beams, "tets": tets, "worker": worker, "schedule": schedule, "first factor after s": came - begun,
+        "all use one after s": ready, "without": without,
+        "factors/s": count / seconds, "used/s": taken_up / seconds,
+        "service us/factor": 1e6 * cpu / max(count, 1), "steps/s": steps / seconds,
         "us p50": 1e6 * float(np.percentile(r["whole"], 50)), "us p99": 1e6 * float(np.percentile(r["whole"], 99)),
         "factor age": float(age.mean()) if len(age) else None,
         "age p99": float(np.percentile(age, 99)) if len(age) else None, "oldest": int(age.max()) if len(age) else None,
@@ -66,10 +79,12 @@ def main() -> None:
     parser.add_argument("tets", type=int)
     parser.add_argument("--device", default="gpu")
     parser.add_argument("--worker", default="gpu")
-    parser.add_argument("--first", type=float, default=15.0)
+    parser.add_argument("--first", type=float, default=15.0, help="s after the first factor, at most")
     parser.add_argument("--seconds", type=float, default=4.0)
+    parser.add_argument("--schedule", default="excess", choices=("excess", "round_robin"))
     o = parser.parse_args()
-    print(json.dumps(measure(o.beams, o.tets, o.device, o.worker, o.first, o.seconds)), flush=True)
+    row = measure(o.beams, o.tets, o.device, o.worker, o.first, o.seconds, o.schedule)
+    print(json.dumps(row), flush=True)
 
 
 if __name__ == "__main__":

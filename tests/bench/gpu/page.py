@@ -10,13 +10,13 @@ from tests.bench.harness.report import Report
 Row = dict[str, Any]
 Data = dict[str, Any]
 KEYS = {  # what tells rows of a section apart
-    "steps": ("tets", "material", "beams", "settings"),
-    "others": ("tets", "material", "what", "settings"),
-    "served": ("tets", "material", "worker", "settings"),
-    "publishing": ("tets", "material", "matrices", "settings"),
-    "realtime": ("tets", "worker", "dt", "settings"),
-    "linearizations": ("tets", "tolerance", "linearizations", "needed", "settings"),
-    "trial": ("tets", "settings"),
+    "steps": ("tets", "material", "beams", "settings", "gpu"),
+    "others": ("tets", "material", "what", "settings", "gpu"),
+    "served": ("tets", "material", "worker", "settings", "gpu"),
+    "publishing": ("tets", "material", "matrices", "settings", "gpu"),
+    "realtime": ("tets", "worker", "dt", "settings", "gpu"),
+    "linearizations": ("tets", "tolerance", "linearizations", "needed", "settings", "gpu"),
+    "trial": ("tets", "settings", "gpu"),
 }
 
 PROBLEM = (
@@ -38,9 +38,10 @@ BATCHED = (
     "own. Others: one step of each round."
 )
 BYTES = (
-    "MB of a step counted from sizes and iterations, each array once per pass over it, over the bandwidth measured: a "
-    "floor for what does not stay in caches (smaller bodies do, and may be faster). Latency: in each iteration two "
-    "sums and the phases of the factor's application wait for other thread blocks; each taken as the barrier measured."
+    "MB of a step counted from sizes and iterations, each array once per pass over it, over the bandwidth measured in "
+    "its run: a floor for what does not stay in caches (smaller bodies do, and may be faster). Latency: in each "
+    "iteration two sums and the phases of the factor's application wait for other thread blocks; each taken as the "
+    "barrier measured."
 )
 OTHERS = (
     "Of the last matrix of a run. The first two are one application of the factor that ours applies once an "
@@ -79,9 +80,18 @@ def merged(parts: list[Data]) -> Data:
     direct = [part["device"]["cuDSS"] for part in parts if part["device"]["cuDSS"] != "absent"]
     out: Data = {"device": parts[-1]["device"] | {"cuDSS": direct[-1] if direct else "absent"}}
     for section, names in KEYS.items():
-        rows = {tuple(row[n] for n in names): row for part in parts for row in part.get(section, [])}
+        told = [
+            _of_its_card(row, part["device"], section == "steps") for part in parts for row in part.get(section, [])
+        ]
+        rows = {tuple(row[n] for n in names): row for row in told}
         out[section] = [rows[key] for key in sorted(rows, key=_order)]
     return out
+
+
+def _of_its_card(row: Row, device: Row, floors: bool) -> Row:
+    """The row with its card, where it does not tell it yet; floors: with what floors of its time are counted from."""
+    told = ("gpu", "copy TB/s", "barrier us") if floors else ("gpu",)
+    return {name: device[name] for name in told} | row
 
 
 def _order(key: tuple[Any, ...]) -> tuple[Any, ...]:
@@ -116,7 +126,7 @@ def write(report: Report, data: Data) -> None:
 
 
 def _beside_one(row: Row, rows: list[Row]) -> Row:
-    same = [r for r in rows if all(r[k] == row[k] for k in ("tets", "settings"))]
+    same = [r for r in rows if all(r[k] == row[k] for k in ("tets", "settings", "gpu"))]
     one = [r["us p50"] for r in same if r["linearizations"] == 1 and r["tolerance"] == 1e-6]
     return {**row, "of one": row["us p50"] / one[0] if one else None}
 
@@ -151,13 +161,13 @@ def _steps(report: Report, data: Data) -> None:
     )  # fmt: skip
     if single := [r for r in rows if r["beams"] == 1]:
         report.say("## One beam")
-        report.table(single, ["tets", "material", *more, *columns])
+        report.table(single, ["tets", "material", "gpu", *more, *columns])
         figure(report, [r for r in single if not r["settings"]], data["others"])
     if batches := [{**r, "beam steps/s": 1e6 * r["beams"] / r["us p50"]} for r in rows if r["beams"] > 1]:
         report.say("## Many beams in the same launches", BATCHED)
-        report.table(batches, ["beams", "tets", *more, "beam steps/s", *columns])
+        report.table(batches, ["beams", "tets", "gpu", *more, "beam steps/s", *columns])
     report.say("## Bytes and latencies", BYTES)
-    floors = [_floors(r, data["device"]) for r in rows]
+    floors = [_floors(row) for row in rows]
     report.table(floors, _columns(floors))
 
 
@@ -166,11 +176,12 @@ def _against(row: Row, data: Data) -> Row:
     name = f"{row['beams']} beams of {row['tets']:,}" if row["beams"] > 1 else f"{row['tets']:,} tets"
     direct = [
         r.get("us") for r in data["others"]
-        if row["beams"] == 1 and (r["tets"], r["material"], r["what"]) == (row["tets"], row["material"], DIRECT)
+        if row["beams"] == 1 and r["what"] == DIRECT and all(r[k] == row[k] for k in ("tets", "material", "gpu"))
     ]  # fmt: skip
     return {
-        "scene": name, "aim": aim.aim, "**ours, p50**": row["us p50"], "ours / aim": row["us p50"] / aim.aim,
-        "p99": row["us p99"], "iterations": row["iterations"], "residual": row["residual"],
+        "scene": name, "gpu": row["gpu"], "aim": aim.aim, "**ours, p50**": row["us p50"],
+        "ours / aim": row["us p50"] / aim.aim, "p99": row["us p99"], "iterations": row["iterations"],
+        "residual": row["residual"],
         "oldest factor": row["oldest"], "prototype": aim.prototype, "CG, same GPU": row.get("CG us"),
         "block Jacobi, same GPU": row.get("block Jacobi us"),
         "direct each step, same GPU": direct[0] if direct else None, "the paper": aim.paper,
@@ -180,11 +191,11 @@ def _against(row: Row, data: Data) -> Row:
 DIRECT = "cuDSS, float64"
 
 
-def _floors(row: Row, device: Row) -> Row:
-    floor, phases = row["MB all"] / device["copy TB/s"], row.get("phases")
-    latency = row["iterations"] * (phases + 2) * device["barrier us"] if phases else None
+def _floors(row: Row) -> Row:
+    floor, phases = row["MB all"] / row["copy TB/s"], row.get("phases")
+    latency = row["iterations"] * (phases + 2) * row["barrier us"] if phases else None
     return {
-        **{k: row[k] for k in ("tets", "material", "beams", "settings", "iterations")},
+        **{k: row[k] for k in ("tets", "material", "beams", "gpu", "settings", "copy TB/s", "iterations")},
         **{f"MB {k}": row[f"MB {k}"] for k in ("matrix", "vectors", "factor", "assembly")},
         "all / bandwidth, us": floor, "phases": phases, "latency, us": latency, "us p50": row["us p50"],
         "p50 / bytes floor": row["us p50"] / floor,

@@ -11,7 +11,7 @@ from pathlib import Path
 from tests.bench.harness.report import ROOT
 from tests.docs import figures
 
-FIRST = ("cpu", "gpu", "models", "paper", "figure4", "warp", "preconditioners", "build")
+FIRST = ("cpu", "gpu", "speed", "models", "paper", "figure4", "warp", "preconditioners", "build")
 PAGES = (
     *FIRST,
     "rosenbrock",

@@ -64,6 +64,10 @@ class PacedLoop:
         """Step of the copy; -1: there is none yet."""
         return int(self._copied[body])
 
+    def matrix_steps(self, bodies: Sequence[int]) -> NDArray[np.int64]:
+        """Steps of the copies of some bodies."""
+        return self._copied[list(bodies)]
+
     def post_factors(self, bodies: Sequence[int], factors: Sequence[Factor]) -> None:
         """Takes factors as the engine does."""
         self._engine.post_factors(bodies, factors)

@@ -130,7 +130,7 @@ static bool solve_in_contact(Loop& loop) {
     }
     for (int i = 0; i < c.islands; ++i) {
         Passes p(loop, i);
-        p.take_up();
+        p.conclude(!(c.report[p.bodies[0]].residual > c.tolerance));
         ContactEnd(p, p.result, p.report).finish();
     }
     if (c.ties.count) TieRows(loop).finish(loop.rings.step + 1);

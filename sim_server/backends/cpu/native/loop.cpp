@@ -128,6 +128,7 @@ static void copy_for_worker(Loop& loop, Body& body) {
     }
     body.snapshot.store(nullptr, std::memory_order_relaxed);
     body.snapshot_step.store(loop.rings.step, std::memory_order_release);
+    wake(loop.rings);
 }
 
 static void write_frame(Loop& loop) {

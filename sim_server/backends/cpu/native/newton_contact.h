@@ -109,8 +109,7 @@ struct ContactSearch : Passes {
         total.passes += report.passes;
         total.residual = report.residual;
         if (result.status == NOT_FINITE && first) search.norm = NAN;
-        const int status = result.status == CONTACT ? CONVERGED : result.status;  // it is the end that counts
-        record_solve(search, result.residual, result.seconds, result.iterations, result.fallbacks, result.kind, status);
+        record_solve(search, result.residual, result.seconds, result.iterations, result.fallbacks, result.kind, result.status);
         search.solve_error = result.solve_error;
         if (search.phase == DONE) {
             move_on();
@@ -275,7 +274,8 @@ static void search_in_contact(Loop& loop) {
     }
     for (int i = 0; i < c.islands; ++i) {
         Passes p(loop, i);
-        p.take_up();
+        p.conclude(true);  // that the law does not hold is known since the sweep
+        for (int m = 0; m < p.count; ++m) loop.newton->search[p.bodies[m]].status = p.result.status;
         ContactEnd(p, p.result, p.report).finish();
     }
 }

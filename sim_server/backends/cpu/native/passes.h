@@ -236,7 +236,6 @@ struct Passes : IslandRows {
             spent = cut();
             hold_limits();
         }
-        if (report.residual > c.tolerance && result.status == CONVERGED) result.status = CONTACT;
     }
 
     // |r| at the state y with the set closed.
@@ -292,5 +291,12 @@ struct Passes : IslandRows {
         result = c.result[bodies[0]];
         report = c.report[bodies[0]];
         for (int m = 1; m < count; ++m) report.clipped = std::max(report.clipped, c.report[bodies[m]].clipped);
+    }
+
+    // At the end of the step. holds: the law does.
+    void conclude(bool holds) {
+        take_up();
+        result.status = status_in_contact(result.status, holds, report.clipped);
+        for (int m = 0; m < count; ++m) c.result[bodies[m]].status = result.status;
     }
 };

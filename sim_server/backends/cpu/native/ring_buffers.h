@@ -1,6 +1,8 @@
 // SPDX-License-Identifier: MIT
 // What the loops of both devices share: records and frames in rings that another thread empties, pace, stop and pause.
 #pragma once
+#include <unistd.h>
+
 #include <atomic>
 #include <chrono>
 #include <cmath>
@@ -34,6 +36,7 @@ struct Rings {
     std::atomic<int64_t> frames_dropped, records_dropped, late_steps;
     int32_t realtime;                      // keep pace with the wall clock
     int32_t patient;                       // wait for room in the rings instead of dropping (no deadline to miss)
+    std::atomic<int32_t> wake;             // eventfd that is written when a matrix that was asked for is there; 0: none
     std::atomic<int32_t> stop;
     std::atomic<int32_t> pause, halted;    // number of a pause, 0: none; the pause in which the loop stands still, 0: it does not
     std::atomic<int64_t> single;           // steps that the loop is to make while it is paused
@@ -52,6 +55,13 @@ static inline bool frame_due(const Rings& rings, int64_t step) {
 static inline bool energy_due(const Rings& rings, int64_t step) {
     const int64_t every = rings.energy_every.load(std::memory_order_relaxed);
     return every > 0 && step % every == 0;
+}
+
+// Wakes who waits for a matrix.
+static inline void wake(const Rings& rings) {
+    const uint64_t one = 1;
+    const int32_t fd = rings.wake.load(std::memory_order_relaxed);
+    if (fd && write(fd, &one, sizeof one) < 0) return;  // full: it is awake
 }
 
 static inline double now() {

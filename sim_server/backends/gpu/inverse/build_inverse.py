@@ -15,6 +15,8 @@ from protocol.factor import FactorPattern
 from sim_server.arrays import Float64
 from sim_server.backends.gpu.cupy_types import DeviceArray, Event, Graph, KernelFunction
 from sim_server.backends.gpu.device import Gpu, no_memory_left
+from sim_server.backends.gpu.device_values import DeviceValues
+from sim_server.backends.gpu.helper import FarInverse, Helper
 from sim_server.backends.gpu.inverse.apply_inverse import Applied, InverseApplication, application_kernels
 from sim_server.backends.gpu.inverse.expansion_batches import (
     BUILDS,
@@ -30,8 +32,9 @@ from sim_server.backends.gpu.inverse.expansion_batches import (
 from sim_server.backends.gpu.inverse.partition import COLUMNS, ROWS
 from sim_server.backends.gpu.inverse.plan import Plan
 from sim_server.backends.gpu.inverse.workspace import workspace
-from sim_server.backends.gpu.pinned import PinnedArray
+from sim_server.backends.gpu.pinned import is_pinned, runs
 
+ALIGNMENT = 64  # numbers; 256 bytes, as of what is allocated alone
 HEAD = BUILDS.itemsize  # bytes in front of the values: struct Builds
 COUNTS = (1, 4, 16, MOST_BUILDS)  # of inverses, for which graphs are made
 Groups = tuple[int, int, int, int]
@@ -59,28 +62,32 @@ class PartitionedInverse(NamedTuple):
     matrix: address of the chunks, float16
     scale: address of d in packed order, float32 (N + 1,): 0 in padding, then the largest d
     event: after it both are complete
+    far: a second GPU's part (helper.py), None: one GPU has it alone
     """
 
     matrix: int
     scale: int
     event: Event
+    far: FarInverse | None = None
 
 
 class InverseStorage(NamedTuple):
-    """Device memory for one inverse. matrix: (chunks, 8, 32) float16. scale: (N + 1,) float32."""
+    """Device memory for one inverse. matrix: (chunks, 8, 32) float16. scale: (N + 1,) float32. far: of a second GPU."""
 
     matrix: DeviceArray
     scale: DeviceArray
+    far: FarInverse | None = None
 
 
 class InverseBuilder:
     """Builds the inverses of factors with one pattern by one plan, for any number of bodies.
 
     most: number that `build_many` takes at a time; smaller than the one given if the workspace would be too large
+    helper: a second GPU that gets the part of the second half of the plan's thread blocks
     """
 
-    def __init__(self, gpu: Gpu, pattern: FactorPattern, plan: Plan, most: int = 1):
-        cp = gpu.cp
+    def __init__(self, gpu: Gpu, pattern: FactorPattern, plan: Plan, most: int = 1, helper: Helper | None = None):
+        cp, self._helper = gpu.cp, helper
         self.plan, self._gpu, self._nonzeros = plan, gpu, pattern.nonzeros
         self._layout = layout = workspace_layout(pattern, plan)
         tables = (layout.parts, layout.columns)
@@ -111,10 +118,19 @@ class InverseBuilder:
         cp, p = self._gpu.cp, self.plan
         made = InverseStorage(cp.zeros((p.chunks, ROWS, COLUMNS), np.float16), cp.zeros(p.size + 1, np.float32))
         cp.cuda.get_current_stream().synchronize()  # zero before a build writes, in its own stream
-        return made
+        return made._replace(far=self._helper.storage(p)) if self._helper else made
+
+    def several_storages(self, count: int) -> list[InverseStorage]:
+        """Allocates memory for several inverses at once, which is given up once none of them is used."""
+        cp, p = self._gpu.cp, self.plan
+        pitch = -(-(p.size + 1) // ALIGNMENT) * ALIGNMENT
+        matrices = cp.zeros((count, p.chunks, ROWS, COLUMNS), np.float16)
+        scales = cp.zeros((count, pitch), np.float32)[:, : p.size + 1]
+        cp.cuda.get_current_stream().synchronize()
+        return [InverseStorage(matrix, scale) for matrix, scale in zip(matrices, scales, strict=True)]
 
     def build(
-        self, values: NDArray[np.floating], storage: InverseStorage, multiprocessors: int | None = None
+        self, values: NDArray[np.floating] | DeviceValues, storage: InverseStorage, multiprocessors: int | None = None
     ) -> PartitionedInverse:
         """Begins to build the inverse for the values (nonzeros,) of L; returns before it is complete.
 
@@ -127,8 +143,11 @@ class InverseBuilder:
         return self.build_many([values], [storage], multiprocessors)[0]
 
     def build_many(
-        self, values: Sequence[NDArray[np.floating]], storages: Sequence[InverseStorage], multiprocessors: int | None
-    ) -> list[PartitionedInverse]:
+        self,
+        values: Sequence[NDArray[np.floating] | DeviceValues],
+        storages: Sequence[InverseStorage],
+        multiprocessors: int | None,
+    ) -> list[PartitionedInverse]:  # fmt: skip
         """Begins to build the inverses of up to `most` factors in the same launches; otherwise as `build`.
 
         Each has the same bits as if it were built alone.
@@ -145,7 +164,8 @@ class InverseBuilder:
             return self._application.begin(inverse.matrix, inverse.scale, r, self._workspace.stream, most)
 
     def _begin(
-        self, values: Sequence[NDArray[np.floating]], storages: Sequence[InverseStorage], multiprocessors: int | None
+        self, values: Sequence[NDArray[np.floating] | DeviceValues], storages: Sequence[InverseStorage],
+        multiprocessors: int | None,
     ) -> list[PartitionedInverse]:  # fmt: skip
         space, cp, count = self._workspace, self._gpu.cp, len(values)
         assert 0 < count <= self.most and count == len(storages)
@@ -155,21 +175,24 @@ class InverseBuilder:
         head["count"] = count
         targets = [(s.matrix.data.ptr, s.scale.data.ptr) for s in storages]
         head["targets"][:count] = np.array(targets, np.uint64).view(INVERSE_STORAGE).ravel()
-        size, first = HEAD + 4 * count * self._nonzeros, values[0]
+        size = HEAD + 4 * count * self._nonzeros
         graph, stream = self._graph(multiprocessors, next(c for c in COUNTS if c >= count)), space.stream
         at, copy, kind = int(space.incoming.data.ptr), cp.cuda.runtime.memcpyAsync, cp.cuda.runtime.memcpyHostToDevice
-        pinned = isinstance(first, PinnedArray) and first.dtype == np.float32 and first.flags.c_contiguous
-        if count == 1 and pinned:
+        if all(each.dtype == np.float32 and is_pinned(each) for each in values):
             copy(at, space.staging.ctypes.data, HEAD, kind, stream.ptr)
-            copy(at + HEAD, first.ctypes.data, size - HEAD, kind, stream.ptr)
+            for begin, source, length in runs(values):
+                copy(at + HEAD + begin, source, length, cp.cuda.runtime.memcpyDefault, stream.ptr)
         else:
             for row, factor in zip(space.staging[HEAD:size].view(np.float32).reshape(count, -1), values, strict=True):
-                np.copyto(row, factor, casting="same_kind")
+                np.copyto(row, np.asarray(factor), casting="same_kind")
             copy(at, space.staging.ctypes.data, size, kind, stream.ptr)
-        space.copied, space.source = stream.record(), first
+        space.copied, space.source = stream.record(), list(values)
         graph.launch(stream)
+        for each in storages:
+            if self._helper and each.far:
+                self._helper.copy(each.far, each.matrix, each.scale, stream)
         done = stream.record()
-        return [PartitionedInverse(*addresses, done) for addresses in targets]
+        return [PartitionedInverse(*at, done, s.far) for at, s in zip(targets, storages, strict=True)]
 
     def _graph(self, limit: int | None, count: int) -> Graph:
         """Returns the graph of a build of up to `count` inverses that keeps at most `limit` multiprocessors busy."""

@@ -5,9 +5,11 @@
 // (Hutchinson 1990; Bekas, Kokiopoulou, Saad, An estimator for the diagonal of a matrix, 2007). The signs are the same each time.
 
 #include <algorithm>
+#include <atomic>
 #include <cmath>
 #include <cstdint>
 #include <cstring>
+#include <thread>
 #include <vector>
 
 namespace {
@@ -52,11 +54,6 @@ void solve(const float* column, const Row* y, int64_t length, uint32_t signs, Ro
     x.high = (a.high + b.high + (c.high + d.high)) / column[0];
 }
 
-}  // namespace
-
-extern "C" {
-
-// super_start, row_start, rows, value_start: as in protocol/factor.py. values: of L. NaN or infinity where L has such values.
 double largest_response(int64_t supernodes, const int32_t* super_start, const int64_t* row_start, const int32_t* rows,
                         const int64_t* value_start, const float* values) {
     const int64_t size = super_start[supernodes];
@@ -85,6 +82,25 @@ double largest_response(int64_t supernodes, const int32_t* super_start, const in
         largest = std::max(largest, response);
     }
     return largest;
+}
+
+}  // namespace
+
+extern "C" {
+
+// super_start, row_start, rows, value_start: as in protocol/factor.py. values: of each of `count` L of this pattern. largest: of
+// each, NaN or infinity where L has such values. threads: that share the work, this one among them.
+void largest_responses(int64_t count, int64_t supernodes, const int32_t* super_start, const int64_t* row_start, const int32_t* rows,
+                       const int64_t* value_start, const float* const* values, double* largest, int32_t threads) {
+    std::atomic<int64_t> next{0};
+    auto work = [&] {
+        for (int64_t i = next++; i < count; i = next++)
+            largest[i] = largest_response(supernodes, super_start, row_start, rows, value_start, values[i]);
+    };
+    std::vector<std::thread> others;
+    for (int32_t k = 1; k < threads; k++) others.emplace_back(work);
+    work();
+    for (std::thread& each : others) each.join();
 }
 
 }  // extern "C"

@@ -10,6 +10,7 @@ a thousand they make a preconditioner that is not positive definite.
 """
 
 import ctypes as c
+from collections.abc import Sequence
 from functools import cache
 from typing import Any
 
@@ -17,9 +18,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from protocol.factor import FactorPattern
+from protocol.validate import helping_threads
+from sim_server.arrays import Float64
 from sim_server.backends.compiler import native
 
 TEXT = "backends/gpu/inverse/digits.cpp"
+FEW = 8  # factors for each thread, at least
 MOST_RESPONSE = 400.0
 """Largest response of a degree of freedom (as estimated: up to twice the true one) that 11 digits are used for."""
 
@@ -27,20 +31,33 @@ MOST_RESPONSE = 400.0
 @cache
 def library() -> c.CDLL:
     """Compiles and loads digits.cpp."""
-    signatures: dict[str, tuple[Any, list[Any]]] = {"largest_response": (c.c_double, [c.c_int64, *[c.c_void_p] * 5])}
+    arguments = [*[c.c_int64] * 2, *[c.c_void_p] * 6, c.c_int32]
+    signatures: dict[str, tuple[Any, list[Any]]] = {"largest_responses": (None, arguments)}
     return native(TEXT, signatures)
 
 
-def largest_response(pattern: FactorPattern, values: NDArray[np.floating]) -> float:
-    """Returns an estimate of the largest A_ii (A^-1)_ii of A = L L^T, the same for the same L; values (nonzeros,) of L.
+def largest_responses(pattern: FactorPattern, values: Sequence[NDArray[np.floating]]) -> Float64:
+    """Returns an estimate of the largest A_ii (A^-1)_ii of each A = L L^T, the same for the same L; values (nonzeros,)
+    of each L.
 
     Takes a few passes over L. From any thread, without Python's lock.
     """
-    numbers = np.ascontiguousarray(values, np.float32)
-    arrays = pattern.super_start, pattern.row_start, pattern.rows, pattern.value_start, numbers
-    return float(library().largest_response(len(pattern.super_start) - 1, *(a.ctypes.data for a in arrays)))
+    numbers = [np.ascontiguousarray(each, np.float32) for each in values]
+    each, found = np.array([one.ctypes.data for one in numbers], np.uintp), np.empty(len(numbers))
+    arrays = pattern.super_start, pattern.row_start, pattern.rows, pattern.value_start, each, found
+    threads = 1 + min(helping_threads(), len(numbers) // FEW)
+    library().largest_responses(
+        len(numbers), len(pattern.super_start) - 1, *(a.ctypes.data for a in arrays), threads
+    )  # fmt: skip
+    return found
 
 
-def planes_for(pattern: FactorPattern, values: NDArray[np.floating]) -> int:
-    """Returns the float16 numbers per entry that the inverse of this factor needs: 1, or 2 for 22 binary digits."""
-    return 1 if largest_response(pattern, values) <= MOST_RESPONSE else 2
+def planes_of(factors: Sequence[tuple[FactorPattern, NDArray[np.floating]]]) -> list[int]:
+    """Returns the float16 numbers per entry that the inverse of each of some factors needs: 1, or 2 for 22 binary
+    digits."""
+    planes = [1] * len(factors)
+    for pattern in dict.fromkeys(pattern for pattern, _ in factors):
+        places = [place for place, (own, _) in enumerate(factors) if own is pattern]
+        for place, response in zip(places, largest_responses(pattern, [factors[k][1] for k in places]), strict=True):
+            planes[place] = 1 if response <= MOST_RESPONSE else 2
+    return planes

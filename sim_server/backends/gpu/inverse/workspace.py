@@ -36,7 +36,7 @@ class Workspace:
         self._pinned: Any = None
         self.staging: NDArray[np.uint8] = np.zeros(0, np.uint8)
         self.copied: Event | None = None
-        self.source: NDArray[Any] | None = None
+        self.source: list[Any] = []
         self.lock = threading.Lock()
 
     def reserve(self, memory: int, incoming: int) -> None:

@@ -1,0 +1,47 @@
+// SPDX-License-Identifier: MIT
+// Copies many arrays, sums them up and looks whether their numbers are finite, in one call without Python's lock (copies.py).
+
+#include <atomic>
+#include <cstdint>
+#include <cstring>
+#include <thread>
+#include <vector>
+
+namespace {
+
+// True unless an exponent has all bits set: NaN or infinity.
+template <class Bits, Bits EXPONENT>
+bool all_finite(const char* data, int64_t bytes) {
+    typedef Bits Word __attribute__((may_alias));
+    const Word* words = reinterpret_cast<const Word*>(data);
+    Bits found = 0;
+    for (int64_t i = 0; i < bytes / int64_t(sizeof(Bits)); i++) found |= Bits((words[i] & EXPONENT) == EXPONENT);
+    return !found;
+}
+
+}  // namespace
+
+extern "C" {
+
+// Copies sources[i] to targets[i], of bytes[i] each; of the copies, or of what is summed up in place without targets, sums[i] is
+// the hash, and finite[i] whether all numbers of `item` bytes, 4 or 8, are finite. own_sources: that is said of the sources.
+// threads: that share the work, this one among them.
+void copy_all(int64_t count, const char* const* sources, char* const* targets, const int64_t* bytes, int32_t item,
+              int32_t own_sources, uint64_t (*hash)(const void*, size_t), uint64_t* sums, uint8_t* finite, int32_t threads) {
+    std::atomic<int64_t> next{0};
+    auto work = [&] {
+        for (int64_t i = next++; i < count; i = next++) {
+            if (targets) std::memcpy(targets[i], sources[i], size_t(bytes[i]));
+            const char* own = own_sources || !targets ? sources[i] : targets[i];
+            finite[i] = item == 8 ? all_finite<uint64_t, 0x7ff0000000000000u>(own, bytes[i])
+                                  : all_finite<uint32_t, 0x7f800000u>(own, bytes[i]);
+            sums[i] = hash(own, size_t(bytes[i]));
+        }
+    };
+    std::vector<std::thread> others;
+    for (int32_t k = 1; k < threads; k++) others.emplace_back(work);
+    work();
+    for (std::thread& each : others) each.join();
+}
+
+}  // extern "C"

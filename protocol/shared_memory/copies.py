@@ -1,0 +1,93 @@
+# SPDX-License-Identifier: MIT
+"""Copies of many arrays in one call of native code, with the checks of what is received.
+
+Python's lock is let go once for all of them, not several times for each: with other threads at work, getting it back
+takes longer than to copy a small array.
+"""
+
+import ctypes as c
+from collections.abc import Sequence
+from functools import cache
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import xxhash
+from numpy.typing import NDArray
+
+from protocol.validate import ALONE, all_finite, checksum, copied, helping_threads
+
+SOURCE = Path(__file__).with_name("copies.cpp")
+HASH = c.CFUNCTYPE(c.c_uint64, c.c_char_p, c.c_size_t)
+NAMES = ("XXH3_64bits_dispatch", "XXH3_64bits")  # the first one chooses the best instructions of the processor
+
+
+@cache
+def hash_address() -> int | None:
+    """Address of xxh3_64 in the library of the package xxhash; None if it does not offer it to others."""
+    library, sample = c.CDLL(import_module("xxhash._xxhash").__file__), bytes(range(256)) * 9
+    for name in NAMES:
+        try:
+            address = c.cast(getattr(library, name), c.c_void_p).value
+        except AttributeError:
+            continue
+        if address and HASH(address)(sample, len(sample)) == xxhash.xxh3_64_intdigest(sample):
+            return address
+    return None
+
+
+class Copies:
+    """Copies, or only sums up, arrays of one type, each contiguous.
+
+    library: of copies.cpp; None: there is no compiler, and NumPy copies one after another
+    """
+
+    def __init__(self, library: c.CDLL | None):
+        self._library = library if hash_address() is not None else None
+        if self._library is not None:
+            i, p = c.c_int32, c.c_void_p
+            arguments: list[Any] = [c.c_int64, p, p, p, i, i, p, p, p, i]
+            self._library.copy_all.restype, self._library.copy_all.argtypes = None, arguments
+
+    def copy(
+        self, sources: Sequence[NDArray[Any]], targets: Sequence[NDArray[Any]], own_sources: bool = False
+    ) -> tuple[list[int], list[bool]]:  # fmt: skip
+        """Copies each source to its target, of the same number of bytes. Returns of each target its `checksum` and
+        `all_finite`.
+
+        own_sources: other processes may write to the targets, so both are told of the sources; else these may be
+        written to meanwhile
+        """
+        if self._library is None:
+            pairs = zip(sources, targets, strict=True)
+            made = [copied(s, t.view(s.dtype), s if own_sources else t.view(s.dtype)) for s, t in pairs]
+            return [each[0] for each in made], [each[1] for each in made]
+        assert all(s.nbytes == t.nbytes for s, t in zip(sources, targets, strict=True))
+        return self._call(sources, _addresses(targets), own_sources)
+
+    def sum_up(self, arrays: Sequence[NDArray[Any]]) -> tuple[list[int], list[bool]]:
+        """Returns `checksum` and `all_finite` of each array."""
+        if self._library is None:
+            return [checksum(each) for each in arrays], [all_finite(each) for each in arrays]
+        return self._call(arrays, None, True)
+
+    def _call(
+        self, sources: Sequence[NDArray[Any]], targets: NDArray[np.uintp] | None, own_sources: bool
+    ) -> tuple[list[int], list[bool]]:  # fmt: skip
+        assert self._library is not None
+        count, item = len(sources), sources[0].itemsize if sources else 4
+        assert item in (4, 8) and all(each.itemsize == item and each.flags.c_contiguous for each in sources)
+        size = np.array([each.nbytes for each in sources], np.int64)
+        begin = _addresses(sources)
+        sums, finite = np.empty(count, np.uint64), np.empty(count, np.bool_)
+        threads = 1 + min(helping_threads(), count - 1) if int(size.sum()) > ALONE else 1
+        self._library.copy_all(
+            count, begin.ctypes.data, None if targets is None else targets.ctypes.data, size.ctypes.data, item,
+            own_sources, hash_address(), sums.ctypes.data, finite.ctypes.data, threads,
+        )  # fmt: skip
+        return sums.tolist(), finite.tolist()
+
+
+def _addresses(arrays: Sequence[NDArray[Any]]) -> NDArray[np.uintp]:
+    return np.array([each.__array_interface__["data"][0] for each in arrays], np.uintp)

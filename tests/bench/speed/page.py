@@ -1,0 +1,114 @@
+# SPDX-License-Identifier: MIT
+"""The page: a row for each aim, and tables of all that was measured."""
+
+from collections.abc import Sequence
+from typing import Any
+
+from tests.bench.harness.report import Report
+from tests.bench.speed.targets import TARGETS, Target
+
+Row = dict[str, Any]
+KEYS = ("what", "tets", "material", "beams", "threads", "settings", "side")
+
+
+def of(rows: Sequence[Row], where: Row, side: str) -> Row | None:
+    """The row of a side that a target means."""
+    wanted = {"side": side, "settings": None, **where}
+    return next((row for row in rows if all(row.get(k) == v for k, v in wanted.items())), None)
+
+
+def _told(row: Row | None, target: Target) -> str:
+    """Its figures: of times p50 / p99 / max."""
+    if row is None or row.get(target.column) is None:
+        return "–"
+    columns = ("p50", "p99", "max") if target.column in ("p50", "p99") else (target.column,)
+    return " / ".join(_number(row[column]) for column in columns)
+
+
+def _number(value: float) -> str:
+    return f"{value:.3g}" if abs(value) < 1000 else f"{value:,.0f}"
+
+
+def summary(rows: Sequence[Row]) -> list[Row]:
+    """A row for each target that was measured on a side."""
+    out = []
+    for target in TARGETS:
+        before, after = (of(rows, target.where, side) for side in ("before", "after"))
+        if before is None and after is None:
+            continue
+        value = after.get(target.column) if after else None
+        out.append(
+            {"what": target.what, "before": _told(before, target), "now": _told(after, target), "unit": target.unit,
+             "goal": target.goal_text(), "met": target.met(value), "what bounds it": target.bound}
+        )  # fmt: skip
+    return out
+
+
+TABLES = (
+    (
+        "threads",
+        "One body on the threads of a CPU",
+        "SOFA's beam (below) on `[solver] threads`: turns of 8 steps with a factor of their first matrix, the same "
+        "for both; wall ms of steps. GB/s of L: bytes of the factor that its solves read, twice an iteration, over "
+        "the time of the whole solve.",
+    ),
+    (
+        "sofa",
+        "SOFA's beam",
+        "1 x 1 x 4 m, E 3 MPa, Poisson 0.3, Rayleigh 0.1 / 0.1, dt 20 ms, equal masses, tolerance 1e-6 of the true "
+        "residual, one thread and a worker process, as fast as it goes. p50, p99, max: ms of the loop's processor "
+        "time; wall: of whole steps. The goal is what was measured for SOFA v17.06 with the logic of its "
+        "asynchronous solver, the same mesh, matrix and stop rule, on another machine (2.5 GHz Cascade Lake, dgemm "
+        "1000 in 35 ms on one thread; here: above).",
+    ),
+    (
+        "steps",
+        "Steps on a GPU",
+        "The beams of [the page of the GPU](gpu.md) with factors 1 to 16 steps old, which are made between the "
+        "rounds; ms of single steps on the device, of all beams together. Factor ms, in use ms: to make all "
+        "factors of a round, and to hand them over. Host us: processor time of the thread that launches a step.",
+    ),
+    (
+        "real_time",
+        "A server in real time",
+        "With one worker process on the same device, dt 10 ms. In use: from the first answer until a step used a "
+        "factor. In the second half of the run: factors a second, their age in steps, ms from the beginning of the "
+        "step whose matrix is factorized to that of the first step with its factor (in whole steps), ms of steps. "
+        "Answers: to status queries.",
+    ),
+    (
+        "many",
+        "A server of many small bodies",
+        "As fast as it goes, one worker process on the same device, measured by its statuses after each body has "
+        "had two factors (ready; or ten seconds). Without: bodies that had none. Ages: of the factors of the last "
+        "step at each look.",
+    ),
+    (
+        "motion",
+        "To an error of 2e-3 of the length",
+        "3,000 tetrahedra of stable Neo-Hookean material, E 1 MPa, Poisson 0.45, no damping, dt 20 ms, two "
+        "linearizations, solves to 1e-3, a factor each 3 steps. Error: largest distance of a node over 1.2 s from "
+        "the same scheme with each step solved exactly, over the length. The goal is what was measured for Newton "
+        "1.8.0's SolverVBD on an H200 in the same way: 300 iterations, 11.4 ms, for 2.3e-3 (10 iterations: 0.39 "
+        "ms, 0.55).",
+    ),
+)
+
+
+def write(report: Report, rows: list[Row]) -> None:
+    """Everything."""
+    report.data["rows"] = rows
+    report.say(
+        "Before and now in one run on the same machine: two processes, one of each checkout, that take turns "
+        "(servers: one after the other). Times are p50 / p99 / max of single steps. A goal is compared with the "
+        "median, or with what the row names. On which machine a row was measured stands in the tables below.",
+    )
+    if aims := summary(rows):
+        report.say("## All of it")
+        report.table(aims)
+    for what, title, words in TABLES:
+        mine = [{k: v for k, v in row.items() if k != "what"} for row in rows if row["what"] == what]
+        if mine:
+            report.say(f"## {title}", words)
+            report.table(mine, list(dict.fromkeys(key for row in mine for key in row)))
+    report.write()

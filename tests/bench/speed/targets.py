@@ -1,0 +1,97 @@
+# SPDX-License-Identifier: MIT
+"""What was aimed at, which figure tells whether it is met, and what bounds it."""
+
+from dataclasses import dataclass
+from typing import Any
+
+SUBTREES = "the memory of all cores: a solve reads L twice an iteration, and the top of its tree is one dense part"
+PHASES = "latency: the phases of the partitioned inverse, each one or two trips through L2"
+BYTES = "bytes of the partitioned inverse at the bandwidth of the memory, a fifth more between phases"
+LINKS = "half of these bytes on each, and the levels at the top of the tree, whose vectors cross between them"
+AGE = "iterations while the factor is too old for what happened"
+WAVES = "bytes of inverses and matrices that stay in no cache, and the slowest body of each wave of thread blocks"
+STAGES = "factorization, inverse and what crosses between two processes"
+THREAD = "the thread that serves the loop: copies out, factors in, in Python"
+
+
+@dataclass(frozen=True)
+class Target:
+    """where: what its row has; column: what is compared; at_least: whether more is better."""
+
+    what: str
+    where: dict[str, Any]
+    goal: float | None
+    unit: str
+    bound: str
+    column: str = "p50"
+    at_least: bool = False
+
+    def goal_text(self) -> str:
+        """The goal as the page shows it."""
+        return "–" if self.goal is None else f"{'at least ' if self.at_least else ''}{self.goal:,g}"
+
+    def met(self, value: float | None) -> str:
+        """yes, no, or a dash where it was not measured or there is no goal."""
+        if value is None or self.goal is None:
+            return "–"
+        return "yes" if (value >= self.goal if self.at_least else value <= self.goal) else "no"
+
+
+def _threads(tets: int, goals: dict[int, float]) -> list[Target]:
+    return [
+        Target(f"CPU, one body of {tets:,} tetrahedra, {n} thread{'s' if n > 1 else ''}",
+               {"what": "threads", "tets": tets, "threads": n}, goal, "ms", SUBTREES)
+        for n, goal in goals.items()
+    ]  # fmt: skip
+
+
+def _steps(what: str, tets: int, goal: float, bound: str, column: str = "p50", **where: Any) -> Target:
+    usual = {"what": "steps", "tets": tets, "material": "homogeneous", "beams": 1}
+    return Target(what, usual | where, goal, "ms", bound, column)
+
+
+def _large(tets: int, goal: float) -> list[Target]:
+    one, two = f"GPU, {tets:,} tetrahedra", "the same on two GPUs"
+    return [_steps(one, tets, goal, BYTES), _steps(two, tets, goal, LINKS, settings="solver.gpus=2")]
+
+
+def _sofa(tets: int, figure: float) -> Target:
+    return Target(
+        f"CPU, SOFA's beam of {tets:,} with a worker; goal: SOFA's own",
+        {"what": "sofa", "tets": tets},
+        figure,
+        "CPU ms",
+        "the step's assembly, and two to four iterations",
+    )
+
+
+def _real_time(what: str, tets: int, column: str, goal: float | None, unit: str, bound: str) -> Target:
+    return Target(what, {"what": "real_time", "tets": tets}, goal, unit, bound, column)
+
+
+TARGETS = (
+    *_threads(24_000, {1: 19, 2: 10, 4: 5.5, 8: 3.5, 12: 3}),
+    *_threads(98_304, {1: 180, 2: 95, 4: 50, 8: 28, 12: 22}),
+    _real_time("GPU server, 98,304, real time: first factor in use", 98_304, "in use s", 1.0, "s", STAGES),
+    _real_time("the same: longest answer to a status query", 98_304, "answer ms max", 50, "ms", "Python's lock"),
+    _real_time("the same: matrix to factor in use, median", 98_304, "in use after ms", 120, "ms", STAGES),
+    _real_time("GPU server, 24,000, real time: first factor in use", 24_000, "in use s", 0.15, "s", STAGES),
+    _real_time("the same: age of factors", 24_000, "factor age", 6, "steps of 10 ms", STAGES),
+    Target("factors a second, 512 bodies of 540, one GPU worker", {"what": "many", "beams": 512}, 5000, "1/s", THREAD,
+           "factors/s", at_least=True),
+    Target("factors a second, 1,024 bodies of 540", {"what": "many", "beams": 1024}, 5000, "1/s", THREAD, "factors/s",
+           at_least=True),
+    Target("age of their factors, mean", {"what": "many", "beams": 1024}, 50, "steps", THREAD, "factor age"),
+    Target("host time of a step of 1,024 bodies", {"what": "many", "beams": 1024}, 40, "us", "records of each body",
+           "host us"),
+    _steps("GPU, 256 bodies of 3,000", 3000, 1.6, WAVES, beams=256),
+    _steps("GPU, 512 bodies of 540", 540, 0.6, WAVES, beams=512),
+    _steps("GPU, 24,000 tetrahedra", 24_000, 0.16, PHASES),
+    _steps("GPU, 24,000, heterogeneous: p99", 24_000, 1.2, AGE, "p99", material="heterogeneous"),
+    _steps("GPU, 98,304 tetrahedra", 98_304, 0.55, BYTES),
+    *_large(405_600, 2.9),
+    *_large(1_029_000, 13),
+    *(_sofa(tets, figure) for tets, figure in {540: 1.1, 3000: 5.95, 7350: 29.4, 24_000: 134.0}.items()),
+    Target("GPU, a step of 3,000 to 2e-3 of the length; goal: Newton's VBD (300 iterations)", {"what": "motion"}, 11.4,
+           "ms", "two linearizations: forces, a fetch of A and of the factor each"),
+)  # fmt: skip

@@ -1,0 +1,145 @@
+# SPDX-License-Identifier: MIT
+"""Factors that come in one message are copied together, and each is judged by itself."""
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from precond_worker.factorization.factorize import Analysis
+from protocol.channels import PROTOCOL, key
+from protocol.messages_pb2 import FactorBatch, Header, Topology
+from protocol.messages_pb2 import Slot as SlotMessage
+from protocol.refused import Refused
+from protocol.validate import checksum
+from sim_server.network import factor_decoder as module
+from sim_server.network.factor_decoder import FactorDecoder
+from sim_server.network.leases import InFlightJob
+from tests.worker.block_matrices import bar_edges, pattern, spd
+
+GRAPHS = [pattern(12, bar_edges(1, 1, 2)), pattern(8, bar_edges(1, 1, 1))]
+MADE = [Analysis(*graph) for graph in GRAPHS]
+KINDS = {"a": 0, "b": 0, "c": 1, "d": 0, "e": 0}  # of the objects
+ROOM = 1 << 14  # bytes
+
+
+class Memory:
+    """A slot of shared memory. bytes: of it"""
+
+    segment, offset = "7.zenoh", 64
+
+    def __init__(self) -> None:
+        self.bytes = np.zeros(len(KINDS) * ROOM, np.uint8)
+        self.capacity = self.bytes.nbytes
+
+    def part(self, first: int, dtype: Any, count: int) -> np.ndarray:
+        return self.bytes[first : first + count * np.dtype(dtype).itemsize].view(dtype)
+
+
+@pytest.fixture
+def stage() -> SimpleNamespace:
+    """decoder, slot, message, answers (place and job of each object), and values by object."""
+    decoder, slot = FactorDecoder(7), Memory()
+    message = FactorBatch(
+        header=Header(protocol=PROTOCOL, incarnation=7), worker="w",
+        slot=SlotMessage(segment=slot.segment, offset=slot.offset, capacity=slot.capacity, generation=3),
+    )  # fmt: skip
+    answers, values = [], {}
+    for place, (name, kind) in enumerate(KINDS.items()):
+        (row_start, columns), made = GRAPHS[kind], MADE[kind]
+        header = Header(protocol=PROTOCOL, incarnation=7, object=name, epoch=1)
+        decoder.announce(
+            Topology(header=header, nodes=len(row_start) - 1, row_start=row_start.tobytes(), columns=columns.tobytes())
+        )
+        decoder.add_pattern(key("pattern", worker="w", object=name), made.pattern.message(header).SerializeToString())
+        values[name] = made.factorize(spd(*GRAPHS[kind], seed=place), np.float32)
+        slot.part(place * ROOM, np.float32, len(values[name]))[:] = values[name]
+        job = InFlightJob(
+            place + 1, name, 1, 5, True, "float32", "w", 9.0, factor_slot=slot, factor_generation=3,  # type: ignore[arg-type]
+            first=place * ROOM, room=ROOM,
+        )  # fmt: skip
+        answers.append((place, job))
+        message.jobs.append(job.number)
+        message.patterns.append(made.pattern.id)
+        message.nonzeros.append(len(values[name]))
+        message.checksums.append(checksum(values[name]))
+        message.seconds.append(0.25)
+    return SimpleNamespace(decoder=decoder, slot=slot, message=message, answers=answers, values=values)
+
+
+def refused(stage: SimpleNamespace) -> dict[str, str]:
+    """Kinds of refusals by object; the others must have their own values."""
+    kinds = {}
+    found = stage.decoder.decode_several(stage.message, stage.answers)
+    for (_, job), each in zip(stage.answers, found, strict=True):
+        if isinstance(each, Refused):
+            kinds[job.object] = each.kind
+        else:
+            assert (each.object, each.step, each.worker, each.seconds) == (job.object, 5, "w", 0.25)
+            np.testing.assert_array_equal(each.values, stage.values[job.object])
+    return kinds
+
+
+def test_they_are_copied_one_behind_the_other_into_memory_of_few_sizes(stage, monkeypatch):
+    """From there a GPU copies them by itself."""
+    monkeypatch.setattr(module, "LARGE", 0)
+    asked = []
+
+    def memory(count: int, dtype: Any) -> np.ndarray:
+        asked.append(count)
+        return np.full(count, np.nan, dtype)
+
+    stage.decoder.memory = memory
+    assert refused(stage) == {}
+    total = sum(len(each) for each in stage.values.values())
+    assert len(asked) == 1 and asked[0] & (asked[0] - 1) == 0 and total <= asked[0] < 2 * total
+    found = [each.values for each in stage.decoder.decode_several(stage.message, stage.answers)]
+    ends = [each.ctypes.data + each.nbytes for each in found]
+    assert [each.ctypes.data for each in found[1:]] == ends[:-1]
+    stage.slot.bytes[:] = 0xFF
+    assert all(np.isfinite(each).all() for each in found), "nobody can write to them any more"
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "kind"),
+    [("seconds", float("nan"), "malformed"), ("seconds", -1.0, "malformed"), ("patterns", 9, "pattern"),
+     ("patterns", MADE[1].pattern.id, "pattern"), ("nonzeros", 5, "shape"), ("checksums", 1, "checksum")],
+)  # fmt: skip
+@pytest.mark.parametrize("place", [0, 1, 4])
+def test_what_is_told_wrong_of_one_costs_the_others_nothing(stage, field, value, kind, place):
+    getattr(stage.message, field)[place] = value
+    name = list(KINDS)[place]
+    assert refused(stage) == {name: kind}
+
+
+@pytest.mark.parametrize(("number", "kind"), [(np.nan, "not_finite"), (np.inf, "not_finite"), (-1.0, "not_positive")])
+@pytest.mark.parametrize("place", [0, 2, 4])
+def test_a_value_that_no_factor_has_costs_the_others_nothing(stage, number, kind, place):
+    name = list(KINDS)[place]
+    made = MADE[KINDS[name]].pattern
+    values = stage.slot.part(place * ROOM, np.float32, made.nonzeros)
+    values[made.diagonal[-1]] = number
+    stage.message.checksums[place] = checksum(values)
+    assert refused(stage) == {name: kind}
+
+
+def test_one_that_has_no_room_of_its_own_is_refused_alone(stage):
+    stage.answers[1][1].room = 64
+    assert refused(stage) == {"b": "slot"}
+    stage.answers[3][1].factor_generation = 4
+    stage.answers[4][1].factor_slot = None
+    assert refused(stage) == {"b": "slot", "d": "slot", "e": "slot"}
+
+
+def test_of_an_object_that_was_split_meanwhile_nothing_is_taken(stage):
+    (row_start, columns), header = GRAPHS[0], Header(protocol=PROTOCOL, incarnation=7, object="b", epoch=2)
+    stage.decoder.announce(
+        Topology(header=header, nodes=len(row_start) - 1, row_start=row_start.tobytes(), columns=columns.tobytes())
+    )
+    assert refused(stage) == {"b": "epoch"}
+
+
+def test_where_all_are_refused_nothing_is_copied(stage):
+    stage.message.slot.generation = 8
+    assert refused(stage) == dict.fromkeys(KINDS, "slot")

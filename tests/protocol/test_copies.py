@@ -1,0 +1,71 @@
+# SPDX-License-Identifier: MIT
+"""Many arrays that are copied and checked in one call."""
+
+import ctypes
+
+import numpy as np
+import pytest
+
+from protocol.shared_memory import copies as module
+from protocol.shared_memory.copies import SOURCE, Copies
+from protocol.validate import ALONE, checksum
+from sim_server.backends.compiler import build
+
+SIZES = (0, 1, 3, 60, 61, 4096, 70_001)
+
+
+@pytest.fixture(scope="module", params=["native", "NumPy"])
+def made(request):
+    return Copies(ctypes.CDLL(str(build(SOURCE, stepping=False))) if request.param == "native" else None)
+
+
+def arrays(dtype, sizes=SIZES):
+    rng = np.random.default_rng(1)
+    return [rng.standard_normal(size).astype(dtype) for size in sizes]
+
+
+def test_native_code_has_the_checksum_of_the_package():
+    assert module.hash_address() is not None  # else every copy of this suite went by NumPy
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_copies_have_the_checksums_of_their_values(made, dtype):
+    sources = arrays(dtype)
+    targets = [np.full_like(each, np.nan) for each in sources]
+    sums, finite = made.copy(sources, targets)
+    assert sums == [checksum(each) for each in sources] == made.sum_up(sources)[0]
+    assert finite == [True] * len(sources)
+    for source, target in zip(sources, targets, strict=True):
+        np.testing.assert_array_equal(target, source)
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize("bad", [np.nan, -np.nan, np.inf, -np.inf])
+def test_numbers_that_are_not_finite_are_found_in_their_array_alone(made, dtype, bad):
+    sources = arrays(dtype)
+    sources[3][17] = sources[6][-1] = bad
+    sources[5][:4] = np.finfo(dtype).max, -np.finfo(dtype).max, np.finfo(dtype).tiny, 0.0
+    expected = [k not in (3, 6) for k in range(len(sources))]
+    assert made.copy(sources, [np.empty_like(each) for each in sources])[1] == expected
+    assert made.sum_up(sources)[1] == expected
+
+
+def test_what_others_write_to_the_targets_changes_no_checksum(made):
+    sources = arrays(np.float32)
+    bytes_of_targets = [np.zeros(each.nbytes, np.uint8) for each in sources]
+    sums, _ = made.copy(sources, bytes_of_targets, own_sources=True)
+    assert sums == [checksum(each) for each in sources]
+    assert [each.tobytes() for each in bytes_of_targets] == [each.tobytes() for each in sources]
+
+
+def test_many_large_arrays_are_shared_by_threads(made, monkeypatch):
+    monkeypatch.setattr(module, "helping_threads", lambda: 3)
+    sources = arrays(np.float64, [ALONE // 8 // 6] * 9)
+    targets = [np.empty_like(each) for each in sources]
+    assert made.copy(sources, targets)[0] == [checksum(each) for each in sources]
+    assert all((target == source).all() for source, target in zip(sources, targets, strict=True))
+
+
+def test_sizes_that_differ_are_a_mistake_of_the_caller(made):
+    with pytest.raises((AssertionError, ValueError)):
+        made.copy([np.zeros(4)], [np.zeros(3)])
