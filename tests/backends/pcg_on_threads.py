@@ -125,11 +125,11 @@ CLOCK = """
 static long long nanoseconds() { static long long now; return now += 1000; }
 """
 WORDS = [
-    (r'asm volatile\("st\.relaxed\.gpu\.global\.u64[^\n]*\n', "bits = w;\n"),
-    (r'asm volatile\("ld\.relaxed\.gpu\.global\.u64[^\n]*\n', "w = *this;\n"),
-    (r'asm volatile\("st\.relaxed\.gpu\.global\.v2.*?"memory"\);',
+    (r'asm volatile\("st\.relaxed\.[^\n]*?\.global\.u64[^\n]*\n', "bits = w;\n"),
+    (r'asm volatile\("ld\.relaxed\.[^\n]*?\.global\.u64[^\n]*\n', "w = *this;\n"),
+    (r'asm volatile\("st\.relaxed\.[^\n]*?\.global\.v2.*?"memory"\);',
      "high = tag | bits >> 32; low = tag | (bits & 0xffffffffull);"),
-    (r'asm volatile\("ld\.relaxed\.gpu\.global\.v2[^\n]*\n', "w = *this;\n"),
+    (r'asm volatile\("ld\.relaxed\.[^\n]*?\.global\.v2[^\n]*\n', "w = *this;\n"),
     (r"    unsigned to = \(unsigned\)__cvta_generic_to_shared\(shared\);.*?\n\}",
      "    std::memcpy(shared, global, bytes);\n}"),
     (r'asm volatile\("cp\.async\.(commit|wait)_group[^\n]*"memory"\);', ""),
