@@ -132,7 +132,7 @@ class GpuEngine(DeviceLoop):
         self._forces = fuse(forces) if alone else ()  # after a whole assembly, whose energy balance is made already
         phases = NewtonPhases.initial(gpu, bodies) if newton else None
         correction = self._correction = FactorCorrection.wanted(gpu, given)
-        self._smoothing = FactorSmoothing.wanted(gpu, given)
+        self._smoothing = None if self._helper else FactorSmoothing.wanted(gpu, given)  # which has half of the inverse
         most_blocks = given.cut.most_blocks if given.cut else ()
         surfaces = given.contact.surfaces if given.contact else None
         self._rows_of_bodies: tuple[NDArray[Any], ...] = (
