@@ -12,6 +12,7 @@ from sim_server.backends.gpu.device import Gpu
 from sim_server.backends.gpu.inverse.plan import FORM, GATHER, Plan
 from sim_server.backends.gpu.structs import PCG
 
+ALIGNMENT = 32  # entries to which the vectors of a body are aligned; 256 bytes
 PADDING = 32  # entries behind the packed vectors, to which padding refers
 TILE_SUMS: int = Declarations("backends/gpu/inverse/partitioned_inverse.cuh").constant("TILE_SUMS")
 ROUND = 6  # constant cost of a product, in chunks
@@ -157,9 +158,10 @@ class DevicePlan:
         self.address = int(self._params.data.ptr)
 
     def vectors(self) -> dict[str, DeviceArray]:
-        """Allocates the vectors of one body, as flag words (block_group.cuh) with exchange number 0."""
-        zeros, n = self.gpu.cp.zeros, self.plan.size + PADDING
-        return {
-            "residual": zeros(2 * n), "product": zeros(n), "z": zeros(n), "formed": zeros(n), "solved": zeros(n),
-            "contributed": zeros(self._contributions),
-        }  # fmt: skip
+        """Allocates the vectors of one body, as flag words (block_group.cuh) with exchange number 0, all at once."""
+        n = self.plan.size + PADDING
+        sizes = {"residual": 2 * n, "product": n, "z": n, "formed": n, "solved": n, "contributed": self._contributions}
+        ends = np.cumsum([-(-size // ALIGNMENT) * ALIGNMENT for size in sizes.values()]).tolist()
+        memory = self.gpu.cp.zeros(ends[-1])
+        begins = zip(sizes.items(), [0, *ends[:-1]], strict=True)
+        return {name: memory[begin : begin + size] for (name, size), begin in begins}
