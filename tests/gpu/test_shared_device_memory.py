@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Device memory that a server shares with workers beside it: who opens it, who dies, and that factors are the same."""
 
+import json
 import os
 import signal
 import subprocess
@@ -21,7 +22,7 @@ from sim_server.backends.shared_memory import PlacedMatrix
 from sim_server.network.device_slots import DeviceSlot, DeviceSlots
 from tests.gpu.opens_memory import COUNT
 from tests.system.link_helpers import process
-from tests.system.server_process import Stage, beam, until
+from tests.system.server_process import Stage, beam, run, until
 from tests.worker.block_matrices import bar_edges, pattern, spd
 
 pytestmark = pytest.mark.gpu
@@ -174,6 +175,21 @@ def test_factors_of_a_server_stay_on_its_gpu(stage: Stage, tmp_path: Path) -> No
         status = client.status()
         assert status.refused == 0 and status.objects[0].factors_refused == 0 and status.workers[0].failures == 0
         until(lambda: client.status().objects[0].last.iterations < 12, "factors are of use")
+
+
+@pytest.mark.timeout(600)
+def test_a_run_whose_factors_stayed_on_its_gpu_repeats_bit_for_bit(stage: Stage, tmp_path: Path) -> None:
+    """The replay makes the factors in its own process, and brings them to the device from the host."""
+    log = tmp_path / "run.mcap"
+    server = stage.server(
+        beam(tmp_path, LARGE), "--device", "gpu", "--workers", "1", "--worker-device", "gpu", "--record", str(log)
+    )
+    with stage.client() as client:
+        until(lambda: on_device(client) > 20, "arrays stay on the device")
+    assert server.end() == 0, server.output()
+    result = run("clients", "replay", str(log), "--simulate", "--json", timeout=300)
+    found = json.loads(result.stdout)
+    assert result.returncode == 0 and found["same"] and found["other_factor"] is None and not found["notes"], found
 
 
 def test_a_worker_that_is_killed_is_replaced_and_memory_is_shared_with_the_next(stage: Stage, tmp_path: Path) -> None:

@@ -548,7 +548,9 @@ def test_what_becomes_of_a_factor_says_nothing_of_the_job_after_it(overlapping, 
 def test_no_matrix_goes_ahead_of_a_check_after_a_refused_factor_and_none_under_adaptive(overlapping):
     driver, _, (second, _), _ = overlapping
     state = driver.bodies[0]
-    state.job.in_flight, driver._behind = False, []
+    state.on_reassignment()
+    assert not len(driver.requests(ahead=True)), "the copies of both are in use"
+    state.job.sent, driver._behind = second.step, []
     ahead = driver.requests(ahead=True)
     assert state.job.checked == second.step and ahead.body.tolist() == [0] and not ahead.in_flight[0]
     assert driver.requests().in_flight.tolist() == [True]

@@ -102,7 +102,7 @@ def _watched(endpoint: str, seconds: float, dt: float, started: float) -> Row:
             "in use s": used, "in use step": step_of_use, "queries": len(waits), "failed": failed,
             "answer ms p50": float(np.percentile(milliseconds, 50)), "answer ms max": float(milliseconds.max()),
             **_of_steps(steps, dt), "late steps": int(status.late_steps),
-            "arrays on device": int(status.bulk_on_device),
+            "arrays on device": int(getattr(status, "bulk_on_device", 0)),  # 0 of older checkouts
         }  # fmt: skip
 
 
