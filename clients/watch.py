@@ -20,6 +20,7 @@ from clients.log.scalars import ended, enum_name, reaction_name
 from protocol import messages_pb2 as pb
 
 PERIOD = 0.5  # s between two readings
+MOST_KEY = 36  # characters of a parameter that are not broken into lines
 ERRORS = {  # fields of ObjectStep with estimated errors -> of what
     "solve_error": "error of the linear solve",
     "step_error": "of the step's equation",
@@ -187,6 +188,8 @@ def _local(status: pb.Status) -> Table:
 def parameter_table(found: Sequence[pb.LiveParameter]) -> Table:
     """Returns a table of keys, values, units and meanings."""
     table = Table("key", "value", "unit", "about", **COMPACT)
+    longest = max((len(short_key(each.now.key)) for each in found), default=0)
+    table.columns[0].min_width, table.columns[0].max_width = min(MOST_KEY, longest), MOST_KEY
     table.columns[0].overflow = table.columns[1].overflow = "fold"
     for each in found:
         _add(table, short_key(each.now.key), each.now.value, each.unit, each.about.split(", or ")[0])

@@ -27,7 +27,7 @@ from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeEl
 from rich.table import Table
 
 from clients.client import Client
-from clients.demo.run import take_hand
+from clients.demo.run import HAND, take_hand
 from clients.errors import ClientError
 from clients.log.frames import Frame
 from clients.log.reader import Log
@@ -41,10 +41,9 @@ ENDPOINT = "tcp/127.0.0.1:7451"  # not the default one: a server of the user's m
 PAGE = 8085  # port of the page, not the default one
 PUSH_AT, GRAB_AT, RELEASE_AT = 60, 125, 265  # steps
 FILM = 2.3, 6.5  # s of simulation: first and last picture
-HAND = (0.225, 0.283, 0.038)  # of the creature, at rest [m]
 WAY = np.array(
     [(0, 0, 0), (0.1, 0.16, 0.1), (-0.2, 0.18, 0.24), (-0.12, -0.14, 0.22), (0.12, -0.04, 0.04)]
-)  # of it [m]
+)  # of the hand that is dragged [m]
 
 TEXT_BROWSERS = {"www-browser", "links", "links2", "elinks", "lynx", "w3m"}  # show no page of WebGL
 MADE = {"film": "gif", "recording": "rrd", "picture": "png", "arrays": "npz"}  # suffixes of what the log becomes

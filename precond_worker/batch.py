@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from precond_worker.arrays import Float64, Int64
 from precond_worker.network.native_copies import native_copies
 from protocol.channels import CHANNELS, MOST_JOBS
-from protocol.factor import FactorPattern
+from protocol.factor import ROOM_ALIGNMENT, FactorPattern
 from protocol.messages_pb2 import FactorBatch, Header, Matrix, MatrixBatch
 from protocol.refused import Refused
 from protocol.shared_memory.pool import HEADER
@@ -22,7 +22,6 @@ from protocol.shared_memory.view import SlotMap
 from protocol.validate import array, check_header, check_strings, parse, take
 
 ENTRY = 9  # values of a block
-ALIGNMENT = 64  # bytes to which the room of a factor is rounded up
 
 
 @dataclass(eq=False)
@@ -108,8 +107,8 @@ def accept_batch(sample: zenoh.Sample, worker: str, incarnation: int) -> Batch:
     for slot, needed in ((message.matrix_slot, 8 * batch.starts[-1]), (message.factor_slot, batch.rooms[-1])):
         if needed > slot.capacity:
             raise Refused(f"MatrixBatch has a slot of {slot.capacity} bytes; needed: {needed}", "slot")
-    if any(room % ALIGNMENT for room in message.rooms):
-        raise Refused(f"MatrixBatch.rooms: not all are multiples of {ALIGNMENT}", "slot")
+    if any(room % ROOM_ALIGNMENT for room in message.rooms):
+        raise Refused(f"MatrixBatch.rooms: not all are multiples of {ROOM_ALIGNMENT}", "slot")
     return batch
 
 

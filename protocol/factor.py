@@ -16,6 +16,7 @@ from protocol.validate import all_finite, array, check_range, checksum
 
 __all__ = ["Factor", "FactorPattern", "Refused", "check_values", "pattern_id"]
 
+ROOM_ALIGNMENT = 64  # bytes to which the room of a factor in the slot of a batch is rounded up
 MOST_VALUES = (1 << 31) - 1  # of a factor, 8 GiB in float32: what a pattern may make its receiver prepare for
 
 Int32 = NDArray[np.int32]

@@ -63,16 +63,17 @@ def list_gallery(asked: bool) -> None:
 
     from sim_server.scene import gallery, load
 
-    table = Table("name", "what", "elements", "command", box=None, pad_edge=False)
-    table.columns[2].justify, table.columns[3].no_wrap = "right", True
+    table = Table("name", "what", "elements", box=None, pad_edge=False)
+    table.columns[0].no_wrap, table.columns[2].justify = True, "right"
     for name in gallery.names():
         file = gallery.FOLDER / f"{name}.toml"
         try:
             elements = sum(len(o.load_mesh().tets) for o in load(file).objects)
         except InputError as error:
             PROGRAM.bad_input(f"{file}: {error}")
-        table.add_row(name, gallery.sentence(name), str(elements), f"sim-server {gallery.name_of(file)} --workers 1")
+        table.add_row(str(gallery.name_of(file)), gallery.sentence(name), str(elements))
     Console().print(table)
+    print("\nTo run one in a browser: sim-server NAME --workers 1 --web")
     raise typer.Exit
 
 

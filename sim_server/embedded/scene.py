@@ -92,7 +92,7 @@ class Scene:
         Meshes of arrays are in the file; other files keep their places, as absolute paths. Raises OSError.
         """
         path = Path(path)
-        path.write_text(_file_text(_given(self.table())), encoding="utf-8")
+        path.write_text(_file_text(without_none(self.table())), encoding="utf-8")
         return path
 
     def __eq__(self, other: object) -> bool:
@@ -121,11 +121,11 @@ def plain(value: Any) -> Any:
     return value.checked if isinstance(value, Mesh) else value
 
 
-def _given(value: Any) -> Any:
+def without_none(value: Any) -> Any:
     """Returns a table without keys that have no value, for which TOML has no word."""
     if isinstance(value, dict):
-        return {key: _given(each) for key, each in value.items() if each is not None}
-    return [_given(each) for each in value] if isinstance(value, list) else value
+        return {key: without_none(each) for key, each in value.items() if each is not None}
+    return [without_none(each) for each in value] if isinstance(value, list) else value
 
 
 def _file_text(table: Mapping[str, Any]) -> str:

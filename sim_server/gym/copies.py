@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_server.embedded.scene import Scene
+from sim_server.embedded.scene import Scene, without_none
 from sim_server.embedded.simulation import Simulation
 from sim_server.errors import InputError
 from sim_server.scene import where
@@ -73,7 +73,7 @@ def copied(scene: Scene, copies: int, effects: Mapping[str, Any]) -> tuple[Scene
     for key in ("object", "holder", "attachment", "spring"):
         if table.get(key):
             table[key] = [_renamed(each, names, k) for k in range(copies) for each in table[key]]
-    return Scene(_given(table)), Copies(names)
+    return Scene(without_none(table)), Copies(names)
 
 
 def _keep_apart(contact: dict[str, Any], objects: list[str]) -> None:
@@ -99,13 +99,6 @@ def _renamed(table: Mapping[str, Any], names: Mapping[str, list[str]], copy: int
             for end in between
         ]
     return new
-
-
-def _given(value: Any) -> Any:
-    """Returns a table without keys that have no value."""
-    if isinstance(value, dict):
-        return {key: _given(each) for key, each in value.items() if each is not None}
-    return [_given(each) for each in value] if isinstance(value, list) else value
 
 
 def _rows(simulation: Simulation, name: str, chosen: Any, what: str) -> list[int]:

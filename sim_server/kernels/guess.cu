@@ -6,6 +6,12 @@
 
 constexpr int ORDERS = 5;  // polynomials of degree 0 to 4 through the last solutions
 
+#ifdef __CUDACC_RTC__  // to single precision, by one instruction: divisions of doubles would take as long as the rest
+INLINE number reciprocal(number a) { float root = rsqrtf((float)a); return root * root; }
+#else
+INLINE number reciprocal(number a) { return 1 / a; }
+#endif
+
 struct Extrapolate {
     int n;              // nodes
     const real* dv;     // (n, 3) solution of the step, world frame [m/s]
@@ -18,7 +24,7 @@ struct Extrapolate {
 // counts less, as after a jump the differences of all orders are equal.
 KERNEL(extrapolate, Extrapolate) {
     vec3 dv = load3(p.dv, i), difference = dv, change = {}, sum = {}, zero = {};
-    number total = {}, row[3 * ORDERS];
+    number total = number{} + (real)1e-30, row[3 * ORDERS];  // 1e-30: no reciprocal is infinite, in float32 either
     real trust = 1;
     for (int k = 0; k < ORDERS; ++k) {
         vec3 before = {row_at<3 * ORDERS>(p.differences, i, 3 * k), row_at<3 * ORDERS>(p.differences, i, 3 * k + 1),
@@ -28,12 +34,12 @@ KERNEL(extrapolate, Extrapolate) {
         row[3 * k + 2] = difference.z;
         if (k > 0) change = change + difference;  // to the next solution, by the polynomial of degree k
         difference = difference - before;
-        number weight = trust / (dot(difference, difference) + (real)1e-30);  // never infinite, in float32 either
+        number weight = trust * reciprocal(dot(difference, difference) + (real)1e-30);
         total += weight;
         sum = sum + weight * change;
         trust *= (real)0.45;
     }
     auto finite = dot(sum, zero) == 0;
     put_row(p.differences, i, p.n, row);
-    store3(p.guess, i, select(finite, dv + (1 / total) * sum, dv));
+    store3(p.guess, i, select(finite, dv + reciprocal(total) * sum, dv));
 }

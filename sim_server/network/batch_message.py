@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from protocol.channels import PROTOCOL
+from protocol.factor import ROOM_ALIGNMENT
 from protocol.messages_pb2 import Header, MatrixBatch
 from protocol.method import Method
 from protocol.shared_memory.pool import Slot
@@ -18,7 +19,6 @@ from sim_server.network.native_copies import native_copies
 from sim_server.updates.factor_source import Job
 
 MOST_TOGETHER = 64  # jobs of a message: as many as a worker on a GPU factorizes together
-ALIGNMENT = 64  # bytes to which the room of a factor is rounded up
 
 
 class Entry(NamedTuple):
@@ -35,7 +35,7 @@ def entries_of(jobs: Sequence[tuple[Job, AnnouncedObject]]) -> list[Entry]:
     made, first = [], 0
     for job, known in jobs:
         size = known.most_values(job.method.name) * np.dtype(job.dtype).itemsize
-        room = -(-size // ALIGNMENT) * ALIGNMENT
+        room = -(-size // ROOM_ALIGNMENT) * ROOM_ALIGNMENT
         made.append(Entry(job, known, room, first))
         first += room
     return made

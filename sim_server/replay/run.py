@@ -37,8 +37,6 @@ from sim_server.updates.worker_assembly import Assembly
 if TYPE_CHECKING:
     from sim_server.effects.touch import Interaction
 
-MESH = ("nodes", "tets", "row_start", "columns", "fixed")
-
 
 class Replay:
     """Repeats one recording. Raises BadLog if its scene cannot be built as it was."""

@@ -58,7 +58,7 @@ Rule = Literal["excess", "round_robin"]
 Precision = Literal["float64", "mixed", "float32"]
 OnRunaway = Literal["freeze", "go_on", "halve"]
 FactorPrecision = Literal["auto", "float16", "float32", "float64"]
-_ALLOWED: dict[str, dict[str, tuple[str, ...]]] = {  # values by option and device
+_ALLOWED: dict[str, dict[str, tuple[str | int, ...]]] = {  # values by option and device
     "preconditioner": {
         "cpu": PRECONDITIONERS,
         "gpu": tuple(p for p in PRECONDITIONERS if p not in CPU_ONLY),
@@ -66,6 +66,7 @@ _ALLOWED: dict[str, dict[str, tuple[str, ...]]] = {  # values by option and devi
     "precision": {"cpu": ("float64",), "gpu": ("float64", "mixed", "float32")},
     "on_runaway": {"cpu": get_args(OnRunaway), "gpu": ("freeze", "go_on")},
     "factor_precision": {"cpu": ("auto", "float32", "float64"), "gpu": ("auto", "float16", "float32")},
+    "gpus": {"cpu": (1,), "gpu": (1, 2)},
 }
 
 
@@ -115,6 +116,9 @@ class SolverOptions(Parameters):
         default="freeze", description="treatment of a body with more energy than accounted for"
     )
     threads: int = Field(default=1, ge=1, le=1024, description="of the simulation on a CPU")
+    gpus: int = Field(
+        default=1, ge=1, le=2, description="of this host that apply the factors of large bodies, on a GPU"
+    )
     warm_start: bool = Field(default=True, description="start from what the last steps' solutions say of this one")
     woodbury: int = Field(
         default=32, ge=0, le=64,

@@ -162,7 +162,8 @@ class Driver:
         """Returns what the scheduler is told of each body but those that are frozen.
 
         ahead: only of those whose last factor is checked beside the steps, which count as in flight otherwise: of those
-            whose next matrix may go ahead of it. It does where factors have been of use and `auto` compares none
+            whose next matrix may go ahead of it, one alone: there are two places for copies. It does where factors
+            have been of use and `auto` compares none
         """
         t, step = self.table, self.engine.step
         tuners = [state.tuner for state in self.bodies] if self._tuned else []
@@ -179,7 +180,8 @@ class Driver:
         if not ahead:
             return every.of(~t.frozen)
         compared = np.array([t is not None and t.factorization.candidate is not None for t in tuners] or False)
-        return every.of(checked & ~t.frozen & (age >= 0) & (t.failures == 0) & ~compared)
+        last = checked & (t.sent == t.checked)
+        return every.of(last & ~t.frozen & (age >= 0) & (t.failures == 0) & ~compared)
 
     def make_job(self, state: BodyUpdateState) -> Job | None:
         """Returns the job of the copy that the loop has made for a body. None: the copy does not suffice and is

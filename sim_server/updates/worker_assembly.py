@@ -24,8 +24,8 @@ from sim_server.scene.model import Scene
 from sim_server.simulation import Simulation
 
 # Settings of the server's device, and what a worker has in their place
-WORKER_SETTINGS = {"precision": "float64", "factor_precision": "auto", "threads": 1, "budget": 0.0, "build": "server",
-        "extrapolate": 0.0, "woodbury": 0}  # fmt: skip
+WORKER_SETTINGS = {"precision": "float64", "factor_precision": "auto", "threads": 1, "gpus": 1, "budget": 0.0,
+        "build": "server", "extrapolate": 0.0, "woodbury": 0}  # fmt: skip
 MOTION = ("keyframes", "moved", "max_speed", "max_turn")  # of a holder: positions come with each job
 
 

@@ -80,6 +80,8 @@ class Stream:
     def record(self) -> Any:
         return SimpleNamespace(ptr=5, synchronize=lambda: None)
 
+    def wait_event(self, event: Any) -> None: ...
+
 
 class Device(FakeDevice):
     """The driver's functions for the native loop, as CudaDevice offers them."""
@@ -184,7 +186,20 @@ def made(folder: Path, library: Any) -> ModuleType:
             found = re.search(FUSED, self.code) if kernel == "fused" else None
             return Function(kernel, self.code, found[1].count(",") + 1 if found else None)
 
-    memory = {"memGetInfo": lambda: (1, 1), "memcpyAsync": lambda *a: None, "memsetAsync": lambda *a: None}
+    class CurrentDevice:
+        """The only one, whatever its number."""
+
+        id, compute_capability, attributes = 0, "90", {"MultiProcessorCount": 132}
+
+        def __init__(self, number: int = 0): ...
+        def __enter__(self) -> None: ...
+        def __exit__(self, *error: object) -> None: ...
+        def use(self) -> None: ...
+
+    memory = {
+        name: lambda *a: None for name in ("memcpyAsync", "memsetAsync", "memcpyPeerAsync", "deviceEnablePeerAccess")
+    }
+    memory |= {"memGetInfo": lambda: (1, 1), "deviceCanAccessPeer": lambda a, b: 1}
     properties = {
         "name": b"Fake", "multiProcessorCount": 132, "sharedMemPerMultiprocessor": 233472,
         "sharedMemPerBlockOptin": 232448,
@@ -202,9 +217,7 @@ def made(folder: Path, library: Any) -> ModuleType:
             memcpyDeviceToHost=2, memcpyDefault=4,
             runtimeGetVersion=lambda: 13000, **memory,
         ),
-        Device=lambda *a: SimpleNamespace(
-            id=0, use=lambda: None, compute_capability="90", attributes={"MultiProcessorCount": 132}
-        ),
+        Device=CurrentDevice, Event=lambda **o: SimpleNamespace(ptr=6, record=lambda stream=None: None),
         Stream=Stream, get_current_stream=CurrentStream, memory=SimpleNamespace(OutOfMemoryError=MemoryError),
         alloc_pinned_memory=lambda size: np.zeros(max(size, 1), np.uint8),
         compiler=SimpleNamespace(CompileException=CompileException),

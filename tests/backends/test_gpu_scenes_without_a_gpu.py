@@ -37,6 +37,10 @@ SCENES = {
     "beam.toml": (),
     "beam.toml, mixed": ("solver.precision=mixed", "solver.factor_precision=float32"),
     "beam.toml, float32": ("solver.precision=float32",),
+    "beam.toml, large, float32": (
+        "object.beam.mesh={ bar = [10, 10, 40], size = [1, 1, 4] }",
+        "solver.precision=float32",
+    ),
     "beam.toml, Newton": ("integrator.linearizations=3", "integrator.scheme=newmark"),
     "beam.toml, accuracy": ("accuracy.position='1 %'", "solver.precision=mixed"),
     "graft.toml, accuracy": ("accuracy.position=1e-4", "solver.precision=mixed"),
@@ -120,7 +124,7 @@ def cupy(tmp_path, monkeypatch):
 def test_a_scene_is_built_and_its_kernels_compile(cupy, name):
     simulation = Simulation.load(f"deploy/scenes/{name.split(',')[0]}", list(SCENES[name]), "gpu")
     built = {kernel for kernel, _ in cupy.calls}
-    assert {"fused", "pcg"} <= built
+    assert {"fused", "pcg"} <= built and ("smoothed" in built) is ("large" in name)
     engine, world, system = simulation.engine, simulation.world, simulation.system
     engine.run(3)
     assert engine.step == 3 and (engine.records()["step"] == np.repeat([1, 2, 3], len(world.bodies))).all()

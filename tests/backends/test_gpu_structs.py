@@ -84,7 +84,7 @@ def test_the_compiler_for_gpus_refuses_another_layout(tmp_path):
 @pytest.mark.parametrize(
     ("threads", "blocks", "more"),
     [(256, 1, []), (128, 2, []), (64, 4, []), (64, 4, ["-DNEWTON_PHASES"]), (256, 1, ["-DSTAGES"]),
-     (256, 1, ["-DCONTACT_PASSES"]), (64, 4, ["-DCONTACT_PASSES"])],
+     (256, 1, ["-DCONTACT_PASSES"]), (64, 4, ["-DCONTACT_PASSES"]), (256, 1, ["-DSMOOTHED"])],
 )  # fmt: skip
 def test_the_solver_spills_no_registers(threads, blocks, more):
     """What does not fit into registers would cost a trip through L2 in each phase: it did, and doubled the time."""
@@ -127,13 +127,16 @@ def test_thread_blocks_take_all_registers():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("threads", "blocks"), [(256, 1), (128, 2), (64, 4)])
-def test_the_application_of_factors_spills_no_registers(threads, blocks):
+@pytest.mark.parametrize(
+    ("text", "threads", "blocks"),
+    [("apply_factor", 256, 1), ("apply_factor", 128, 2), ("apply_factor", 64, 4), ("smoothed", 256, 1)],
+)
+def test_the_application_of_factors_spills_no_registers(text, threads, blocks):
     if (library := nvrtc.library()) is None:
         pytest.skip("needs the package nvidia-cuda-nvrtc")
     options = [*device_options(PRECISIONS["float64"]), *own_headers(), "--ptxas-options=-v", "-arch=sm_90"]
     options += [f"-DTHREADS={threads}", f"-DPER_PROCESSOR={blocks}"]
-    code, said = nvrtc.compiled(library, SOURCES / "backends/gpu/apply_factor.cu", options)
+    code, said = nvrtc.compiled(library, SOURCES / f"backends/gpu/{text}.cu", options)
     spilled = [int(n) for n in re.findall(r"(\d+) bytes (?:stack frame|spill stores|spill loads)", said)]
     assert code and spilled and max(spilled) == 0, said
 

@@ -103,7 +103,6 @@ def test_the_default_has_the_launches_of_backward_euler_alone():
         "time_integration.inertia",
         *exact[1:-2],
         "time_integration.advance",
-        "guess.extrapolate",
     ]
 
 

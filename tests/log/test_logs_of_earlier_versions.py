@@ -36,18 +36,20 @@ def machine() -> dict[str, str]:
 class Differences(Comparison):
     """Collects by how much solves and frames differ, too.
 
-    iterations: largest difference; distance [m]: largest difference of positions; exact: entries of EXACT that differ
+    more, fewer: iterations than recorded, at most; distance [m]: largest difference of positions; exact: entries of
+    EXACT that differ
     """
 
     def __init__(self, recording: Recording):
         super().__init__(recording)
-        self.iterations, self.distance = 0, 0.0
+        self.more, self.fewer, self.distance = 0, 0, 0.0
         self.exact: list[tuple[int, str]] = []
 
     def solves(self, records: NDArray[Any], rows: list[Any]) -> None:
         super().solves(records, rows)
         for record, row in zip(records, rows, strict=True):
-            self.iterations = max(self.iterations, abs(int(record["iterations"]) - int(row["iterations"])))
+            difference = int(record["iterations"]) - int(row["iterations"])
+            self.more, self.fewer = max(self.more, difference), max(self.fewer, -difference)
             self.exact += [(int(row["step"]), name) for name in EXACT if record[name] != row[name]]
 
     def frame(self, step: int, name: str, recorded: Pair, now: Pair) -> None:
@@ -58,7 +60,8 @@ class Differences(Comparison):
 @pytest.mark.parametrize("log", sorted(DATA.glob("*.mcap")), ids=lambda path: path.stem)
 def test_a_log_of_an_earlier_version_is_repeated(log: Path) -> None:
     """The same bit for bit where it was recorded; elsewhere the last digits of sums differ, and with them iterations
-    by one. If a change is meant to alter bits, record the logs anew (data/README.md) beside these."""
+    by one. Since solves start from a guess (mechanics/guess.py) those that have one take fewer iterations, to the same
+    tolerance. If a change is meant to alter bits, record the logs anew (data/README.md) beside these."""
     with Recording(log) as recording:
         replay = Replay(recording)
         found = Differences(recording)
@@ -69,10 +72,11 @@ def test_a_log_of_an_earlier_version_is_repeated(log: Path) -> None:
     assert (recording.steps, found.solves_compared) == (STEPS, OBJECTS * STEPS)
     assert found.frames_compared == OBJECTS * (STEPS // EVERY + 1)
     recorded_here = machine() == json.loads((DATA / "recorded_on.json").read_text())
-    if recorded_here and not any("here by another" in note for note in found.notes):
+    guessed = replay.simulation.system.guess is not None
+    if recorded_here and not guessed and not any("here by another" in note for note in found.notes):
         assert found.same, found.lines()
     assert not found.exact, found.lines()
-    assert found.iterations <= 1, found.lines()
+    assert found.more <= 1 and (guessed or found.fewer <= 1), found.lines()
     assert found.distance < TOLERANCE, found.lines()
 
 

@@ -11,6 +11,8 @@ from sim_server.service.commands import Commands
 from sim_server.service.halts import MAX_HALTS, Halts
 from tests.scenes import bar, simulation
 
+LongStep = Callable[[str, str], None]
+
 
 class Server:
     """A paused server. answers: of its commands by number, in the order in which they come"""
@@ -43,6 +45,20 @@ class Server:
 @pytest.fixture
 def server() -> Server:
     return Server()
+
+
+@pytest.fixture
+def in_a_long_step(server: Server, monkeypatch: pytest.MonkeyPatch) -> LongStep:
+    """Sends a verb to a server that runs; a bound of halts.py, by its name, is over before the step."""
+
+    def send(verb: str, bound: str) -> None:
+        server.send("resume")
+        with monkeypatch.context() as patch:
+            patch.setattr(halts, bound, 0.0)
+            server.send(verb)
+            server.halts.answer()
+
+    return send
 
 
 def test_steps_that_are_too_many_to_wait_for_are_refused(server: Server) -> None:
@@ -89,12 +105,8 @@ def test_a_pause_is_answered_by_its_own_standing_still(server: Server) -> None:
     assert server.answers[1] == ("paused", "")
 
 
-def test_a_pause_of_a_long_step_says_that_it_runs(server: Server, monkeypatch: pytest.MonkeyPatch) -> None:
-    server.send("resume")
-    monkeypatch.setattr(halts, "HALT_TIMEOUT", 0.0)
-    server.send("pause")
-    server.halts.answer()
-    monkeypatch.undo()
+def test_a_pause_of_a_long_step_says_that_it_runs(server: Server, in_a_long_step: LongStep) -> None:
+    in_a_long_step("pause", "HALT_TIMEOUT")
     assert server.answers[1] == ("running", "")
     server.send("pause")
     server.halts.answer()
@@ -103,19 +115,13 @@ def test_a_pause_of_a_long_step_says_that_it_runs(server: Server, monkeypatch: p
     assert server.answers[2] == ("paused", "")
 
 
-def test_a_stop_tells_the_last_step_however_long_it_takes(server: Server, monkeypatch: pytest.MonkeyPatch) -> None:
-    server.send("resume")
-    monkeypatch.setattr(halts, "HALT_TIMEOUT", 0.0)
-    server.send("stop")
-    server.halts.answer()
+def test_a_stop_tells_the_last_step_however_long_it_takes(server: Server, in_a_long_step: LongStep) -> None:
+    in_a_long_step("stop", "HALT_TIMEOUT")
     assert 1 not in server.answers, "it would tell a step that is not the last"
     server.halts.answer(ended=True)
     assert server.answers[1] == ("stopping", "")
 
 
-def test_a_stop_in_a_step_without_end_says_that_it_runs(server: Server, monkeypatch: pytest.MonkeyPatch) -> None:
-    server.send("resume")
-    monkeypatch.setattr(halts, "STEPS_TIMEOUT", 0.0)
-    server.send("stop")
-    server.halts.answer()
+def test_a_stop_in_a_step_without_end_says_that_it_runs(server: Server, in_a_long_step: LongStep) -> None:
+    in_a_long_step("stop", "STEPS_TIMEOUT")
     assert server.answers[1] == ("running", "")

@@ -78,19 +78,14 @@ def run(sim: Simulation, steps: int = 48, every: int = 24) -> NDArray[Any]:
     return np.asarray(sim.engine.records())
 
 
-@pytest.mark.parametrize(
-    ("scheme", "most"), [("backward_euler", 0.8), ("newmark", 1.0), ("bdf2", 0.95), ("generalized_alpha", 1.0)]
-)
-def test_iterations_are_saved_and_answers_are_the_same(monkeypatch, scheme, most):
-    """most: of the iterations without. Schemes that damp less have more to guess."""
-    integrator = {"scheme": scheme}
-    sim = swinging(integrator=integrator)
+def test_iterations_are_saved_and_answers_are_the_same(monkeypatch):
+    sim = swinging()
     found = run(sim)
     monkeypatch.setattr(simulations, "make_guess", lambda *given: None)
-    other = swinging(integrator=integrator)
+    other = swinging()
     expected = run(other)
     assert (found["status"] == 0).all() and (expected["status"] == 0).all()
-    assert found["iterations"].sum() < most * expected["iterations"].sum()
+    assert found["iterations"].sum() < 0.8 * expected["iterations"].sum()
     np.testing.assert_allclose(sim.world.x, other.world.x, atol=2e-5)
 
 
@@ -122,7 +117,7 @@ def test_a_checkpoint_from_before_it_goes_on():
     ("table", "wanted"),
     [({}, True), ({"warm_start": False}, False), ({"on_runaway": "halve"}, False),
      ({"integrator": {"scheme": "ros2"}}, False), ({"integrator": {"linearizations": 4}}, False),
-     ({"integrator": {"scheme": "newmark"}}, True)],
+     ({"integrator": {"scheme": "newmark"}}, False)],
 )  # fmt: skip
 def test_scenes_that_have_it(table, wanted):
     sim = swinging(**table)

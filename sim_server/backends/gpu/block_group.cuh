@@ -15,6 +15,12 @@
 #define AT_ONCE 5  // words that a thread loads at a time: 160 thread blocks, or 2560 entries of a vector, in one trip
 #endif
 
+#ifdef HELPED  // words are written and read by thread blocks of two devices (helper.cuh)
+#define WORD_SCOPE "sys"
+#else
+#define WORD_SCOPE "gpu"
+#endif
+
 extern __shared__ __align__(16) char shared_memory[];
 
 // Allocates shared memory, once per body. Null if it does not fit; global memory is used instead.
@@ -54,11 +60,11 @@ template <> struct FlagWord<float> {
     unsigned long long bits;
     __device__ __forceinline__ void put(float v, unsigned number) {
         const unsigned long long w = (unsigned long long)number << 32 | __float_as_uint(v);
-        asm volatile("st.relaxed.gpu.global.u64 [%0], %1;" ::"l"(this), "l"(w) : "memory");
+        asm volatile("st.relaxed." WORD_SCOPE ".global.u64 [%0], %1;" ::"l"(this), "l"(w) : "memory");
     }
     __device__ __forceinline__ FlagWord<float> load() const {  // a copy of the word
         FlagWord<float> w;
-        asm volatile("ld.relaxed.gpu.global.u64 %0, [%1];" : "=l"(w.bits) : "l"(this));
+        asm volatile("ld.relaxed." WORD_SCOPE ".global.u64 %0, [%1];" : "=l"(w.bits) : "l"(this));
         return w;
     }
     __device__ __forceinline__ bool unpack(float& v, unsigned number) const {
@@ -71,12 +77,12 @@ template <> struct __align__(16) FlagWord<double> {
     unsigned long long high, low;
     __device__ __forceinline__ void put(double v, unsigned number) {
         const unsigned long long bits = __double_as_longlong(v), tag = (unsigned long long)number << 32;
-        asm volatile("st.relaxed.gpu.global.v2.u64 [%0], {%1, %2};" ::"l"(this), "l"(tag | bits >> 32), "l"(tag | (bits & 0xffffffffull))
+        asm volatile("st.relaxed." WORD_SCOPE ".global.v2.u64 [%0], {%1, %2};" ::"l"(this), "l"(tag | bits >> 32), "l"(tag | (bits & 0xffffffffull))
                      : "memory");
     }
     __device__ __forceinline__ FlagWord<double> load() const {
         FlagWord<double> w;
-        asm volatile("ld.relaxed.gpu.global.v2.u64 {%0, %1}, [%2];" : "=l"(w.high), "=l"(w.low) : "l"(this));
+        asm volatile("ld.relaxed." WORD_SCOPE ".global.v2.u64 {%0, %1}, [%2];" : "=l"(w.high), "=l"(w.low) : "l"(this));
         return w;
     }
     __device__ __forceinline__ bool unpack(double& v, unsigned number) const {

@@ -75,6 +75,10 @@ class Stream(Protocol):
         """Appends a new event."""
         ...
 
+    def wait_event(self, event: Event) -> None:
+        """Has the work that follows wait for an event."""
+        ...
+
     def begin_capture(self) -> None:
         """Records the work that follows in a graph instead of doing it."""
         ...

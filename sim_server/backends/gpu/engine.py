@@ -29,6 +29,7 @@ from sim_server.backends.gpu.device import DeviceLaunch, Gpu
 from sim_server.backends.gpu.energies import DeviceEnergies
 from sim_server.backends.gpu.factor_upload import FactorUpload
 from sim_server.backends.gpu.held import HeldForces, leading
+from sim_server.backends.gpu.helper import Helper
 from sim_server.backends.gpu.kernel_fusion import DOMAINS, Epilogue, FusedKernel, Prologue, fuse
 from sim_server.backends.gpu.known_patterns import KnownPatterns
 from sim_server.backends.gpu.loop import CAPACITY, GRAPH_STEPS, DeviceLoop
@@ -96,6 +97,7 @@ class GpuEngine(DeviceLoop):
     capabilities: frozenset[Capability] = frozenset()
 
     def __init__(self, gpu: Gpu, given: EngineInput, records: int | None = None):
+        self._helper = Helper.wanted(gpu, given)
         assemble, integrate = (cast(Sequence[DeviceLaunch], part) for part in (given.assemble, given.integrate))
         self.launches, self._first = [*assemble, *integrate], assemble[: leading(assemble)]
         self._history = cast(Sequence[DeviceLaunch], given.history)
@@ -130,7 +132,7 @@ class GpuEngine(DeviceLoop):
         self._forces = fuse(forces) if alone else ()  # after a whole assembly, whose energy balance is made already
         phases = NewtonPhases.initial(gpu, bodies) if newton else None
         correction = self._correction = FactorCorrection.wanted(gpu, given)
-        self._smoothing = FactorSmoothing.wanted(gpu, given)
+        self._smoothing = None if self._helper else FactorSmoothing.wanted(gpu, given)  # which has half of the inverse
         most_blocks = given.cut.most_blocks if given.cut else ()
         surfaces = given.contact.surfaces if given.contact else None
         self._rows_of_bodies: tuple[NDArray[Any], ...] = (
@@ -142,7 +144,7 @@ class GpuEngine(DeviceLoop):
             phases.of_solves(errors) if phases else (), ATTEMPTS if stages else 0,
             given.contact is not None,
             given.contact is not None and bool(given.contact.surfaces or given.contact.ties), correction, errors,
-            budgets, given.cut, self._smoothing,
+            budgets, given.cut, self._smoothing, self._helper,
         )  # fmt: skip
         self._newton, newton_results = None, None
         if newton and phases:
@@ -422,7 +424,11 @@ class GpuEngine(DeviceLoop):
         if self.stages:
             self.stages.launch()
         else:
+            if self._helper:
+                self._helper.begin()
             (self._newton or self._contact or self._substeps or self.solver).launch()
+            if self._helper:
+                self._helper.end()
             if self._held:
                 self._held.launch()
             assert self._integrate is not None

@@ -65,6 +65,9 @@ struct BlockMemory {  // static shared memory of a thread block: data that is th
     long long began, deadline;     // of the solve [ns]
     long long looked;              // at the clock, by the first thread of the first thread block
 #endif
+#ifdef HELPED
+    BodyHelp help;
+#endif
 #ifdef SMOOTHED
     long long slow;                // of the body, as solves before left it
     int limit;                     // iterations after which a solve may go on smoothed
@@ -114,6 +117,10 @@ struct PcgSolver {
         Arena arena = {shared_memory, shared_memory + s.shared};
         PartitionedInverse inverse;
         const bool inverted = body.plan && (body.kind == CHOLESKY || body.probe > 0);
+#ifdef HELPED
+        inverse.far = inverted ? memory.help.far : 0;
+        if (inverse.far && group.index == 0) memory.help.prepare(body.helper);
+#endif
         if (inverted) inverse.reserve(&memory.plan, group.index, arena);
         BlockRows rows;
         rows.set_up(s, body, range, arena, inverted);
@@ -168,7 +175,11 @@ struct PcgSolver {
 #ifdef CUTS
         if (memory.rows.place[k / 3] & APART) scaled = 0;
 #endif
-        to[memory.rows.position(k / 3) + k % 3].put(scaled, group.number);
+        FlagWord<float>& word = to[memory.rows.position(k / 3) + k % 3];
+        word.put(scaled, group.number);
+#ifdef HELPED
+        if (memory.rows.place[k / 3] & RESIDUAL_FAR) put_far(word, memory.inverse.far, scaled, group.number);
+#endif
     }
 
     // z at entry k of the halo, by what P has made there.
@@ -438,6 +449,9 @@ struct PcgSolver {
 #else
         group.sums<1, 1>(mine, zr);
 #endif
+#ifdef HELPED
+        if (kind == CHOLESKY && memory.inverse.far) zr[0] += memory.help.sum(group);
+#endif
         return zr[0];
     }
 
@@ -476,6 +490,10 @@ struct PcgSolver {
         if (!fetched) fetch();
         if (!arrived) copies_end<0>();
         arrived = true;
+#ifdef HELPED
+        if (inverse.far && group.index == 0)
+            memory.help.apply(memory.body.helper, from.r == residuals(1), from.r_number, from.q_number, from.alpha, 1 - turn, group.number, unit);
+#endif
         for (int phase = 0; phase < inverse.phases; ++phase) {
             inverse.gather(phase, from, group.number, unit);
             __syncthreads();
@@ -559,7 +577,12 @@ struct PcgSolver {
         __syncthreads();
         choose_slots(m, c.share + first, memory.body.nodes, c.capacity);
         compare_blocks(m, c.share + first, c.difference + 6ll * first, c.bodies[body].block);
-        for (int k = threadIdx.x; k < m.used; k += THREADS) m.place[k] = memory.plan.place[m.node[k]];
+        for (int k = threadIdx.x; k < m.used; k += THREADS) {
+            m.place[k] = memory.plan.place[m.node[k]];
+#ifdef HELPED
+            m.place[k] &= ~RESIDUAL_FAR;
+#endif
+        }
         __syncthreads();
         column = m.fresh_count ? 3 * m.fresh[0] : -1;
         return true;
@@ -890,6 +913,15 @@ __device__ __forceinline__ void PcgSolver::solve() {
 #define CORRECTION_PARAMETER
 #define CORRECTED_BY
 #endif
+#ifdef HELPED  // another device applies a part of the inverses (helper.cuh)
+#define HELP , const Help help
+#define HELP_PARAMETER , const Help& help
+#define HELPED_BY , help
+#else
+#define HELP
+#define HELP_PARAMETER
+#define HELPED_BY
+#endif
 #ifdef STAGES
 #define STAGE_PARAMETER , const StageSolve& stage
 #elif defined(JUDGES)
@@ -900,7 +932,7 @@ __device__ __forceinline__ void PcgSolver::solve() {
 #define STAGE_PARAMETER
 #endif
 
-__device__ __forceinline__ void solve_body(const PcgArguments& s, const RowRange& range STAGE_PARAMETER CORRECTION_PARAMETER) {
+__device__ __forceinline__ void solve_body(const PcgArguments& s, const RowRange& range STAGE_PARAMETER CORRECTION_PARAMETER HELP_PARAMETER) {
     const int k = range.body;
     for (int i = threadIdx.x; i < (int)(sizeof(PcgBody) / 4); i += THREADS) ((int*)&memory.body)[i] = ((const int*)(s.bodies + k))[i];
     if (threadIdx.x == THREADS - 1) memory.rests = s.moving[k] == 0;
@@ -934,6 +966,9 @@ __device__ __forceinline__ void solve_body(const PcgArguments& s, const RowRange
         memory.correction.used = correction.bodies[k].used;
         memory.correction.usable = correction.bodies[k].usable;
     }
+#endif
+#ifdef HELPED
+    if (threadIdx.x == 0) memory.help.begin(help, k, memory.body);
 #endif
 #ifdef SMOOTHED
     if (threadIdx.x == 0) memory.limit = smoothing_limit(memory.body, memory.slow);
@@ -996,6 +1031,9 @@ __device__ __forceinline__ void solve_body(const PcgArguments& s, const RowRange
 #ifdef CORRECTED
     if (range.index == 0) solver.keep_correction();
 #endif
+#ifdef HELPED
+    if (range.index == 0) memory.help.end();
+#endif
 #ifdef JUDGES
     if (range.index == 0 && threadIdx.x == 0) search[k] = memory.search;  // all thread blocks have read it
 #endif
@@ -1041,7 +1079,7 @@ __device__ __forceinline__ bool takes_part(const PcgArguments& s, const StageSol
 }
 #endif
 
-extern "C" __global__ void __launch_bounds__(THREADS, PER_PROCESSOR) pcg(const PcgArguments s KIND_OF_STEP CORRECTION) {
+extern "C" __global__ void __launch_bounds__(THREADS, PER_PROCESSOR) pcg(const PcgArguments s KIND_OF_STEP CORRECTION HELP) {
 #ifdef NEWTON_PHASES
     if (*active == 0) return;
 #endif
@@ -1066,6 +1104,6 @@ extern "C" __global__ void __launch_bounds__(THREADS, PER_PROCESSOR) pcg(const P
             __syncthreads();  // all threads have read memory.next
             continue;
         }
-        solve_body(s, s.row_ranges[next] STAGE CORRECTED_BY);
+        solve_body(s, s.row_ranges[next] STAGE CORRECTED_BY HELPED_BY);
     }
 }

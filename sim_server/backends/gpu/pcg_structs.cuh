@@ -17,8 +17,8 @@ struct __align__(16) WarpSegment {
 };
 
 // Eight or sixteen rows of a part's matrix: `chunks` chunks of 8 rows x 32 columns from `chunk` on, then those of the other
-// eight rows. x: first entry of the vector; out: first result.
-struct __align__(16) Tile { int chunk, x, chunks, out, rows, unused[3]; };
+// eight rows. x: first entry of the vector; out: first result; elsewhere, -DHELPED: the other device reads the results, too.
+struct __align__(16) Tile { int chunk, x, chunks, out, rows, elsewhere, unused[2]; };
 
 // First and number of the segments, tiles and chunks of a thread block.
 struct BlockRanges { int segment, segments, tile, tiles, chunk, chunks, unused[2]; };
@@ -63,6 +63,7 @@ struct PcgBody {
     FlagWord<float>* solved;       // (size + 32,) z / d
     FlagWord<float>* contributed;  // contributions of parts below
     int planes;                    // float16 numbers per entry of the inverse
+    int helper;                    // -DHELPED: row in Help.far; 0: no other device has a part of this inverse
 };
 
 // Wall time of a body's search, on the device's clock, as it took last (step_budget.cuh).

@@ -38,12 +38,12 @@ class FactorSmoothing:
 
     @classmethod
     def wanted(cls, gpu: Gpu, given: EngineInput) -> "FactorSmoothing | None":
-        """Returns that of a scene with large bodies whose steps are one plain solve each."""
+        """Returns that of a scene with large bodies, on one GPU, whose steps are one plain solve each."""
         solver = given.solver
         others = (given.newton, given.stages, given.substeps, given.contact, given.cut)
         budgets = solver.budget or solver.step_budget
         if not solver.wants_factors or given.errors or budgets or any(part is not None for part in others):
             return None
-        if max(last - first for first, last in given.ranges) < LEAST_NODES:
+        if solver.gpus > 1 or max(last - first for first, last in given.ranges) < LEAST_NODES:
             return None
         return cls(gpu, len(given.ranges))

@@ -19,6 +19,7 @@ from sim_server.backends.gpu.cupy_types import DeviceArray, KernelFunction
 from sim_server.backends.gpu.device import Gpu, compiled, options, own_headers
 from sim_server.backends.gpu.device_values import DeviceValues
 from sim_server.backends.gpu.followed_rows import FollowedRows
+from sim_server.backends.gpu.helper import LEAST_NODES, FarVectors, Helper
 from sim_server.backends.gpu.inverse.build_inverse import InverseBuilder, PartitionedInverse, builder_kernels
 from sim_server.backends.gpu.inverse.device_digits import LARGE, LargeFactors, digits_kernels
 from sim_server.backends.gpu.inverse.device_plan import DevicePlan, shared_bytes
@@ -28,6 +29,7 @@ from sim_server.backends.gpu.inverse.plan import plan
 from sim_server.backends.gpu.row_partition import SPARED, best_assignment, halo, initial_ranges, lists_of
 from sim_server.backends.gpu.smoothing import FactorSmoothing
 from sim_server.backends.gpu.structs import CONTACT, CORRECTION, PCG, PCG_RESULT, STAGES
+from sim_server.errors import InputError
 
 T = TypeVar("T")
 
@@ -42,6 +44,7 @@ class PlannedInverse(NamedTuple):
 
     plan: DevicePlan
     builder: InverseBuilder
+    far: DevicePlan | None = None  # in the memory of a second GPU
 
 
 # Bytes in shared memory of a block of A, of a node, and of the rest (spmv.cuh).
@@ -81,6 +84,7 @@ class PcgSolver:
     budgets: True for a scene whose solves may end by their wall time (step_budget.cuh); they estimate errors, too
     smoothing: of factors that are too old; None: they are left as they are
     cut: what tells of nodes that lose elements, and how many blocks A has at most; None: no body can be cut
+    helper: a second GPU that applies half of the inverses of large bodies
 
     followed: what follows the pattern of A then (`follow`), else None
     params: arguments of the kernel (PCG_ARGUMENTS)
@@ -96,11 +100,12 @@ class PcgSolver:
         capacity: int, planes: int | None = 1, phases: Sequence[DeviceArray] = (), attempts: int = 0,
         contact: bool = False, between: bool = False, correction: FactorCorrection | None = None, errors: bool = False,
         budgets: bool = False, cut: CutInput | None = None, smoothing: FactorSmoothing | None = None,
+        helper: Helper | None = None,
     ):  # fmt: skip
         cp, processors = gpu.cp, gpu.properties["multiProcessorCount"]
         self.gpu, self.counter, self._capacity, self.planes, self._phases = gpu, counter, capacity, planes, phases
         self._attempts, self._contact, self._correction, self.errors = attempts, contact, correction, errors
-        self.budgets, self._cut = budgets, cut
+        self.budgets, self._cut, self._helper = budgets, cut, helper
         most_blocks = cut.most_blocks if cut else ()
         self._twins = {name: gpu.twin(arrays[name]) for name in ("row_start", "values", "b", "y", "moving")}
         self.real = np.dtype(self._twins["values"].dtype)
@@ -152,6 +157,16 @@ class PcgSolver:
             self._work["split_step"] = cp.zeros(len(ranges), np.int64)
         fixed = 5120 if correction else 2048  # bytes: shared memory that pcg.cu declares, and the driver's
         self._shared = (gpu.properties["sharedMemPerMultiprocessor"] // blocks - fixed - 1024) // 16 * 16
+        self._helped = np.zeros(len(ranges), bool)
+        if helper:
+            self._helped = (nodes >= LEAST_NODES) & (assigned.first >= 0)
+            if not self._helped.any() or blocks > 1:
+                raise InputError(
+                    f"solver.gpus = 2: the largest object has {nodes.max()} nodes; two GPUs are for objects of "
+                    f"{LEAST_NODES} and more, allowed is 1"
+                )
+            initial = initial_ranges(assigned, partition, self.grid)
+            helper.connect_solver(nodes, self.threads, self._shared, partition.ranges, initial, self._types)
         self.params = self._arguments(total, assigned.pooled)
         self._device = cp.cuda.Device()
         self._planner = ThreadPoolExecutor(1, "plans of inverses")
@@ -166,6 +181,7 @@ class PcgSolver:
         self._lock = threading.Lock()
         self._plans: dict[tuple[int, int, int], Future[PlannedInverse]] = {}  # by pattern, planes, thread blocks
         self._vectors: dict[tuple[int, int], dict[str, DeviceArray]] = {}  # by body and plan
+        self._far_vectors: dict[tuple[int, int], FarVectors] = {}  # likewise, of bodies that a second GPU helps
         self._plan_in_row: dict[int, DevicePlan] = {}  # by body
         self._factor_bytes = [0] * len(ranges)
 
@@ -202,6 +218,7 @@ class PcgSolver:
             made = [self._plans.pop(key) for key in gone]
             addresses = {each.result().plan.address for each in made if each.exception() is None}
             self._vectors = {key: made for key, made in self._vectors.items() if key[1] not in addresses}
+            self._far_vectors = {key: made for key, made in self._far_vectors.items() if key[1] not in addresses}
 
     def _compiled(self, name: str, blocks: int) -> KernelFunction:
         """Compiles the kernel of the text <name>.cu for `blocks` thread blocks a multiprocessor."""
@@ -220,6 +237,7 @@ class PcgSolver:
                 *(["-DSMOOTHED"] if "slow" in self._work and name == "pcg" else []),
                 *(["-DCUTS"] if self._cut and name == "pcg" else []),
                 *(["-DSPLITS"] if self.followed else []),
+                *(["-DHELPED"] if self._helper and name == "pcg" else []),
             ),
             backend="nvrtc",
             enable_cooperative_groups=True,
@@ -242,8 +260,9 @@ class PcgSolver:
 
     @property
     def _corrected(self) -> tuple[NDArray[Any], ...]:
-        """The last argument of pcg.cu, if there is one."""
-        return (self._correction.params,) if self._correction else ()
+        """The last arguments of pcg.cu, if there are any."""
+        parts = self._correction, self._helper
+        return tuple(part.params for part in parts if part)
 
     def solve_contact(self, b: DeviceArray, contact: NDArray[Any]) -> None:
         """Launches a solve of a step with contact (contact_state.cuh).
@@ -309,7 +328,7 @@ class PcgSolver:
         made in a thread. Its result raises what `plan` raises. planes: float16 numbers per entry; None: those of
         usual factors"""
         planes = planes or self.planes or 1
-        blocks = int(self.bodies[body]["blocks"])
+        blocks = int(self.bodies[body]["blocks"]) * (2 if self._helped[body] else 1)
         key = (pattern.id, planes, blocks)
         with self._lock:
             if key in self._plans:
@@ -338,11 +357,15 @@ class PcgSolver:
                 f"{pattern.size} degrees of freedom in {blocks} thread blocks need {needed} bytes of shared memory "
                 f"each, allowed: {self._shared}"
             )
-        alike = (3 * self.bodies["nodes"] == pattern.size) & (self.bodies["blocks"] == blocks)
-        builder = InverseBuilder(self.gpu, pattern, found, int(alike.sum()))
+        alike = 3 * self.bodies["nodes"] == pattern.size
+        helper = self._helper if (self._helped & alike).any() else None  # bodies of one size are all helped, or none
+        most = int((alike & (self.bodies["blocks"] == blocks // (2 if helper else 1))).sum())
+        builder = InverseBuilder(self.gpu, pattern, found, most, helper)
         if self.planes is None and 4 * pattern.nonzeros > LARGE:
             self._large.expect(pattern)
-        return PlannedInverse(DevicePlan(self.gpu, found, self.threads // 32), builder)
+        warps, own = self.threads // 32, blocks // 2 if helper else blocks
+        far = helper.plan(found, warps) if helper else None
+        return PlannedInverse(DevicePlan(self.gpu, found, warps, 0 if self._helper else None, own), builder, far)
 
     def plan(self, body: int, pattern: FactorPattern, planes: int) -> DevicePlan:
         """Returns the plan of the inverse of factors of this pattern for a body; waits until it is made.
@@ -355,21 +378,36 @@ class PcgSolver:
         """Allocates the vectors of solves of a body with factors of this plan, unless they are there. From any thread;
         the caller has them complete before a step reads them."""
         with self._lock:
-            if (key := (body, plan.address)) not in self._vectors:
+            key = body, plan.address
+            if self._helper and self._helped[body]:
+                if key not in self._far_vectors:
+                    self._far_vectors[key] = self._helper.vectors(plan)
+            elif key not in self._vectors:
                 self._vectors[key] = plan.vectors()
 
     def use(self, body: int, pattern: FactorPattern, inverse: PartitionedInverse, planes: int, step: int) -> None:
         """Writes a factor into the host row of a body; it is in use once the row is uploaded."""
         device_plan, row = self.plan(body, pattern, planes), self.bodies[body]
         row["matrix"], row["scale"], row["factor_step"] = inverse.matrix, inverse.scale, step
-        if self._plan_in_row.get(body) is device_plan:
-            return
-        self._plan_in_row[body] = device_plan
-        row["plan"], row["planes"] = device_plan.address, planes
-        self.reserve_vectors(body, device_plan)
-        for name, array in self._vectors[body, device_plan.address].items():
-            row[name] = array.data.ptr
-        self._factor_bytes[body] = device_plan.bytes
+        if self._plan_in_row.get(body) is not device_plan:
+            self._plan_in_row[body] = device_plan
+            row["plan"], row["planes"] = device_plan.address, planes
+            self.reserve_vectors(body, device_plan)
+            for name, address in self._addresses(body, device_plan).items():
+                row[name] = address
+            self._factor_bytes[body] = device_plan.bytes
+        row["helper"] = 0
+        if self._helper and inverse.far:
+            far_plan = self.begin_plan(body, pattern, planes).result().far
+            assert far_plan is not None
+            row["helper"] = self._helper.use(row, inverse.far, far_plan, self._far_vectors[body, device_plan.address])
+
+    def _addresses(self, body: int, plan: DevicePlan) -> dict[str, int]:
+        """Returns the addresses of the vectors of a body, by name."""
+        key = body, plan.address
+        if key in self._far_vectors:
+            return self._far_vectors[key].here
+        return {name: int(array.data.ptr) for name, array in self._vectors[key].items()}
 
     def factor_bytes(self, body: int) -> int:
         """Returns the bytes that an application of the factor in a body's host row reads, 0 without one."""

@@ -6,6 +6,9 @@
 #ifdef CUTS
 #include "cut_nodes.cuh"
 #endif
+#ifdef HELPED
+#include "helper.cuh"
+#endif
 #include "invert3.cuh"
 
 #define TOGETHER 3                   // rows that a warp multiplies at a time
@@ -18,7 +21,7 @@ struct BlockRows {
     int begin, own, halo;  // own nodes [begin, begin + own) of the body; nodes read
     const int* nodes;      // (halo,) of the body
     real* values;          // (halo, 3) of the vector that A multiplies
-    int* place;            // (halo,) position from which its next values are read; -DCUTS: and flags of cut_nodes.cuh
+    int* place;            // (halo,) position from which its next values are read; -DCUTS, -DHELPED: and flags
     real *x, *r, *q;       // (own, 3)
 #ifdef ERRORS
     real* before;          // (own, 3) x at the last look (iterate_error.cuh)
@@ -34,7 +37,11 @@ struct BlockRows {
 
     // Position from which the values of a node of the halo are read.
     __device__ __forceinline__ int position(int node) const {
-#ifdef CUTS
+#if defined(CUTS) && defined(HELPED)
+        return place[node] & PLACE & ~RESIDUAL_FAR;
+#elif defined(HELPED)
+        return place[node] & ~RESIDUAL_FAR;
+#elif defined(CUTS)
         return place[node] & PLACE;
 #else
         return place[node];

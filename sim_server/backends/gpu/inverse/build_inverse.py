@@ -16,6 +16,7 @@ from sim_server.arrays import Float64
 from sim_server.backends.gpu.cupy_types import DeviceArray, Event, Graph, KernelFunction
 from sim_server.backends.gpu.device import Gpu, no_memory_left
 from sim_server.backends.gpu.device_values import DeviceValues
+from sim_server.backends.gpu.helper import FarInverse, Helper
 from sim_server.backends.gpu.inverse.apply_inverse import Applied, InverseApplication, application_kernels
 from sim_server.backends.gpu.inverse.expansion_batches import (
     BUILDS,
@@ -61,28 +62,32 @@ class PartitionedInverse(NamedTuple):
     matrix: address of the chunks, float16
     scale: address of d in packed order, float32 (N + 1,): 0 in padding, then the largest d
     event: after it both are complete
+    far: a second GPU's part (helper.py), None: one GPU has it alone
     """
 
     matrix: int
     scale: int
     event: Event
+    far: FarInverse | None = None
 
 
 class InverseStorage(NamedTuple):
-    """Device memory for one inverse. matrix: (chunks, 8, 32) float16. scale: (N + 1,) float32."""
+    """Device memory for one inverse. matrix: (chunks, 8, 32) float16. scale: (N + 1,) float32. far: of a second GPU."""
 
     matrix: DeviceArray
     scale: DeviceArray
+    far: FarInverse | None = None
 
 
 class InverseBuilder:
     """Builds the inverses of factors with one pattern by one plan, for any number of bodies.
 
     most: number that `build_many` takes at a time; smaller than the one given if the workspace would be too large
+    helper: a second GPU that gets the part of the second half of the plan's thread blocks
     """
 
-    def __init__(self, gpu: Gpu, pattern: FactorPattern, plan: Plan, most: int = 1):
-        cp = gpu.cp
+    def __init__(self, gpu: Gpu, pattern: FactorPattern, plan: Plan, most: int = 1, helper: Helper | None = None):
+        cp, self._helper = gpu.cp, helper
         self.plan, self._gpu, self._nonzeros = plan, gpu, pattern.nonzeros
         self._layout = layout = workspace_layout(pattern, plan)
         tables = (layout.parts, layout.columns)
@@ -113,7 +118,7 @@ class InverseBuilder:
         cp, p = self._gpu.cp, self.plan
         made = InverseStorage(cp.zeros((p.chunks, ROWS, COLUMNS), np.float16), cp.zeros(p.size + 1, np.float32))
         cp.cuda.get_current_stream().synchronize()  # zero before a build writes, in its own stream
-        return made
+        return made._replace(far=self._helper.storage(p)) if self._helper else made
 
     def several_storages(self, count: int) -> list[InverseStorage]:
         """Allocates memory for several inverses at once, which is given up once none of them is used."""
@@ -183,8 +188,11 @@ class InverseBuilder:
             copy(at, space.staging.ctypes.data, size, kind, stream.ptr)
         space.copied, space.source = stream.record(), list(values)
         graph.launch(stream)
+        for each in storages:
+            if self._helper and each.far:
+                self._helper.copy(each.far, each.matrix, each.scale, stream)
         done = stream.record()
-        return [PartitionedInverse(*addresses, done) for addresses in targets]
+        return [PartitionedInverse(*at, done, s.far) for at, s in zip(targets, storages, strict=True)]
 
     def _graph(self, limit: int | None, count: int) -> Graph:
         """Returns the graph of a build of up to `count` inverses that keeps at most `limit` multiprocessors busy."""

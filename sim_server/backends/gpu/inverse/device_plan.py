@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from sim_server.backends.declarations import Declarations
 from sim_server.backends.gpu.cupy_types import DeviceArray
 from sim_server.backends.gpu.device import Gpu
+from sim_server.backends.gpu.inverse.halves import FarFlags
 from sim_server.backends.gpu.inverse.plan import FORM, GATHER, Plan
 from sim_server.backends.gpu.structs import PCG
 
@@ -126,11 +127,13 @@ class DevicePlan:
     """A plan on the device.
 
     warps: of a thread block
+    device: thread blocks before `first` are on device 0, the others on device 1, and this is the plan of one of these
+        (halves.py); None: for a solver without another device
     address: of the struct DevicePlan (pcg_structs.cuh)
     bytes: of the matrices
     """
 
-    def __init__(self, gpu: Gpu, plan: Plan, warps: int):
+    def __init__(self, gpu: Gpu, plan: Plan, warps: int, device: int | None = None, first: int = 0):
         self.gpu, self.plan = gpu, plan
         self.bytes = int(plan.chunks) * 512
         segment_start, cut = warp_segments(plan)
@@ -147,6 +150,13 @@ class DevicePlan:
             "segments": cut[segment_order], "index": entry_index(plan, cut[segment_order]), "tiles": tiles,
             "target": target, "place": plan.place,
         }  # fmt: skip
+        if device is not None:
+            far = FarFlags(plan, first, device)
+            phase = np.repeat(np.arange(plan.blocks * plan.phases) % plan.phases, np.diff(tile_start))
+            target[plan.slots] |= far.contributions()
+            arrays["segments"][:, 0] |= far.segments(arrays["segments"])
+            tiles[:, 5] = far.tiles(tiles, phase)
+            arrays["place"] = plan.place | far.places()
         self.arrays = {name: gpu.cp.asarray(array.astype(np.int32, copy=False)) for name, array in arrays.items()}
         params = np.zeros((), DEVICE_PLAN)
         params["phases"], params["blocks"], params["groups"] = plan.phases, plan.blocks, plan.groups
@@ -158,8 +168,11 @@ class DevicePlan:
 
     def vectors(self) -> dict[str, DeviceArray]:
         """Allocates the vectors of one body, as flag words (block_group.cuh) with exchange number 0."""
-        zeros, n = self.gpu.cp.zeros, self.plan.size + PADDING
+        return {name: self.gpu.cp.zeros(count) for name, count in self.vector_sizes().items()}
+
+    def vector_sizes(self) -> dict[str, int]:
+        """Returns the words of each of these vectors."""
+        n = self.plan.size + PADDING
         return {
-            "residual": zeros(2 * n), "product": zeros(n), "z": zeros(n), "formed": zeros(n), "solved": zeros(n),
-            "contributed": zeros(self._contributions),
+            "residual": 2 * n, "product": n, "z": n, "formed": n, "solved": n, "contributed": self._contributions,
         }  # fmt: skip

@@ -6,6 +6,9 @@
 // 1024 bytes of matrix, so memory is the limit.
 #pragma once
 #include "block_group.cuh"
+#ifdef HELPED
+#include "helper.cuh"
+#endif
 
 #define LOW 2048.0f
 #ifndef CHUNKS_AT_ONCE
@@ -95,6 +98,37 @@ struct PartitionedInverse {
     const int* where;        // (segments, 32) DevicePlan.index
     const Tile* tiles;
     int size, phases, groups;
+#ifdef HELPED
+    long long far;           // bytes from a word to its copy in the memory of the other device; 0: one device alone applies the inverse
+#endif
+
+    // Writes a word for the thread blocks of this device, and of the other one if `elsewhere`.
+    __device__ __forceinline__ void put_for_all(FlagWord<float>& word, float v, unsigned number, [[maybe_unused]] bool elsewhere) const {
+        word.put(v, number);
+#ifdef HELPED
+        if (elsewhere) put_far(word, far, v, number);
+#endif
+    }
+
+    // at: of DevicePlan.target
+    __device__ __forceinline__ void put_contribution(int at, float v, unsigned number) const {
+#ifdef HELPED
+        FlagWord<float>& word = contributed[at & (NEAR_READS - 1)];
+        if (at & NEAR_READS) word.put(v, number);
+        if (at & FAR_READS) put_far(word, far, v, number);
+#else
+        contributed[at].put(v, number);
+#endif
+    }
+
+    // Writes a word that the solver reads.
+    __device__ __forceinline__ void put_for_solver(FlagWord<float>& word, float v, unsigned number) const {
+#ifdef HELPER
+        put_far(word, far, v, number);
+#else
+        word.put(v, number);
+#endif
+    }
 
     // Copies a list into shared memory if it is short, since loads after a barrier miss L1.
     template <class T>
@@ -189,7 +223,7 @@ struct PartitionedInverse {
     __device__ __forceinline__ void put(const WarpSegment& segment, float v, unsigned number, float unit) const {
         const int lane = threadIdx.x % 32;
         put_halves(vector, segment.to + lane, unit * v);
-        if (segment.keep & 1) formed[segment.from + lane].put(v, number);
+        if (segment.keep & 1) put_for_all(formed[segment.from + lane], v, number, segment.kind != 0);
     }
 
     // Segments of the later phases up to the top: residual minus contributions.
@@ -326,6 +360,7 @@ struct PartitionedInverse {
         double zr = 0;
         int i = 0;
         float d = 0;
+        bool elsewhere = false;  // -DHELPED: the other device reads the result
         FlagWord<float> r, q;  // of d r, for z . r
         auto look_up = [&](const Tile& tile, int row) {  // loads before the product, whose latency hides theirs
             i = tile.out + row;
@@ -333,17 +368,20 @@ struct PartitionedInverse {
                 i = plan->target[i];
                 return;
             }
+#ifdef HELPED
+            elsewhere = tile.elsewhere;
+#endif
             d = scale[i];
             r = from.r[i].load();
             if (from.alpha != 0) q = product[i].load();
         };
         auto finish = [&](float value) {
             if (forward) {
-                contributed[i].put(value, number);
+                put_contribution(i, value, number);
                 return;
             }
-            solved[i].put(value, number);
-            z[i].put(d * value, number);
+            put_for_all(solved[i], value, number, elsewhere);
+            put_for_solver(z[i], d * value, number);
             if (d == 0) return;  // padding
             float ri, qi = 0;
             for (unsigned spins = 0; keep_polling(!r.unpack(ri, from.r_number), spins);) r = from.r[i].load();
