@@ -74,8 +74,9 @@ def test_a_grab_that_a_factor_does_not_know(woodbury):
     (two, x), (one, alone) = (held(CELLS["larger"], "gpu", gpus=gpus, woodbury=woodbury) for gpus in (2, 1))
     assert np.abs(x - alone).max() < 1e-6
     for found, expected in zip(two, one, strict=True):
-        assert (found["status"] == SolveStatus.CONVERGED).all() and not found["fallbacks"].any()
-        assert (found["iterations"] <= expected["iterations"] + 2).all()
+        assert (found["status"] == SolveStatus.CONVERGED).all()
+        assert found["fallbacks"].sum() <= expected["fallbacks"].sum()
+        assert (found["iterations"] <= 1.2 * expected["iterations"] + 3).all()
 
 
 def test_passes_of_contact_with_a_floor():
