@@ -304,7 +304,8 @@ class Worker:
                 self._forget()
                 self._connection.follow(incarnation)
                 self._on_server(True)
-                self._unprepared.append(None)
+                if self._connection.shared_memory:  # topologies are large for a network, and jobs may never come
+                    self._unprepared.append(None)
                 return
 
     def _forget(self) -> None:

@@ -45,12 +45,9 @@ def make_guess(scene: Scene, world: World, dv: Float64) -> Guess | None:
     That are other schemes than backward Euler, which hardly damp, so that their solutions zigzag and next to nothing
     is saved; scenes with several linearizations a step, of whose solves only the first one could begin with it; those
     with `[accuracy]`, whose estimates know the errors of the last solution, which are smoother than those of a guess
-    (with one they were too small by up to 20 times where bodies are stiff); and those in which the steps of single
-    bodies are not those of the scheme, or nodes are copied.
+    (with one they were too small by up to 20 times where bodies are stiff); and those in which nodes are copied.
     """
-    integrator, solver = scene.integrator, scene.solver
+    integrator = scene.integrator
     if integrator.scheme != "backward_euler" or integrator.linearizations > 1 or scene.accuracy is not None:
         return None
-    if world.splitting is not None or solver.on_runaway == "halve" or not solver.warm_start:
-        return None
-    return Guess(world, dv)
+    return Guess(world, dv) if scene.solver.warm_start and world.splitting is None else None

@@ -19,7 +19,7 @@ def row_of(unit: str) -> dict[str, Any]:
     if kind == "steps":
         material = next((word for word in rest if word.isalpha()), "homogeneous")
         row |= {"material": material, "beams": next((int(word) for word in rest if word.isdigit()), 1)}
-    return row | ({"beams": int(rest[0])} if kind == "many" else {})
+    return row | ({"beams": int(rest[0])} if kind in ("many", "swinging") else {})
 
 
 def test_units_measure_what_is_aimed_at() -> None:

@@ -90,6 +90,7 @@ class FakeConnection:
         self.preconditioner = "cholesky"
         self.told, self.together = 0, 0  # times that it said hello; matrices that it factorizes together
         self.without_token: set[int] = set()
+        self.shared_memory = True
 
     def has_token(self, incarnation: int) -> bool:
         return incarnation not in self.without_token
@@ -239,6 +240,12 @@ def test_nothing_is_prepared_for_other_factors_or_where_objects_are_many(
     while not ahead.idle:
         ahead.step(0.0)
     assert connection.asked == [("scene", 0)] and Ready.made == []
+
+
+def test_a_worker_elsewhere_asks_for_nothing_before_its_first_job(ahead: Worker, connection: FakeConnection) -> None:
+    connection.shared_memory = False
+    ahead.take_in(0.0)
+    assert ahead.idle and ahead.waiting == 0 and connection.asked == []
 
 
 def test_what_cannot_be_prepared_is_left_for_the_first_job(

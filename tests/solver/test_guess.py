@@ -115,7 +115,7 @@ def test_a_checkpoint_from_before_it_goes_on():
 
 @pytest.mark.parametrize(
     ("table", "wanted"),
-    [({}, True), ({"warm_start": False}, False), ({"on_runaway": "halve"}, False),
+    [({}, True), ({"warm_start": False}, False), ({"on_runaway": "halve"}, True),
      ({"integrator": {"scheme": "ros2"}}, False), ({"integrator": {"linearizations": 4}}, False),
      ({"integrator": {"scheme": "newmark"}}, False)],
 )  # fmt: skip

@@ -11,6 +11,7 @@ import pytest
 
 from clients.client import Client
 from clients.log.reader import Log
+from protocol.shared_memory import limits as shm_limits
 from sim_server import cli
 from sim_server.errors import InputError
 from sim_server.network.link import ServerLink
@@ -84,6 +85,7 @@ def test_a_run_that_does_not_wait_sends_the_matrix_of_its_very_first_step(tmp_pa
     assert not thread.is_alive()
 
 
+@pytest.mark.skipif(bool(shm_limits.obstacle()), reason=f"no shared memory here: {shm_limits.obstacle()}")
 def test_a_worker_is_ready_for_a_large_object_before_its_first_matrix(tmp_path: Path) -> None:
     """It has sent the pattern of the factors, so that their size is known, and the server finds out."""
     endpoint = free_endpoint()

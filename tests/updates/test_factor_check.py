@@ -111,6 +111,35 @@ def test_one_that_is_to_take_the_place_of_the_matrix_is_its_factor(dtype):
     assert check.reject_reasons([(regularized, matrix)])[0] == "", "it cannot be"
 
 
+class OnDevice:
+    """Values that lie on a device."""
+
+    def __init__(self, values: NDArray):
+        self._host, self.dtype, self.nbytes, self.read = values, values.dtype, values.nbytes, 0
+
+    def __len__(self) -> int:
+        return len(self._host)
+
+    def __array__(self, dtype: type | None = None, copy: bool | None = None) -> NDArray:
+        self.read += 1
+        return self._host
+
+
+def test_one_that_somebody_applies_is_judged_by_that_and_its_values_are_not_read():
+    sim = bent(1)
+    check, matrix = check_of(sim)
+    factor = made(sim)
+    values = OnDevice(factor.values)
+    there, r = dataclasses.replace(factor, values=values), check.vector(factor.object, 1)
+    z = np.linalg.solve(sim.matrix().toarray(), r)
+    alone, beside = check.probe(factor, matrix), check.probe_all([(there, matrix)], lambda: z)[0]
+    np.testing.assert_allclose(beside[:3], alone[:3], rtol=1e-4)
+    assert beside.residual < 1e-9 and values.read == 0
+    assert check.reject_reasons([(there, matrix)], lambda: z) == [""]
+    assert "positive definite" in check.reject_reasons([(there, matrix)], lambda: -z)[0] and values.read == 0
+    assert check.probe_all([(there, matrix)], lambda: None)[0] == alone and values.read == 1, "nobody could apply it"
+
+
 def test_of_another_size():
     sim, other = bent(), simulation(bar((3, 2, 2), name="bar"))
     other.engine.assemble()

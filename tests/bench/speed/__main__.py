@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: MIT
 """How fast this checkout is beside another one, on the same machine in one run and where it can be in turns.
 
-Units: threads:TETS[:TURNS], sofa:TETS, steps:TETS[:heterogeneous|:BEAMS], real_time:TETS, many:TETS:BEAMS, vbd:TETS.
+Units: threads:TETS[:TURNS], sofa:TETS, steps:TETS[:heterogeneous|:BEAMS], real_time:TETS, many:TETS:BEAMS,
+swinging:TETS:BEAMS, vbd:TETS.
 --other names a checkout of another commit (`git worktree add DIR COMMIT`); without it this one is measured alone.
 """
 
@@ -25,13 +26,14 @@ TITLE, SIDES = "Speed, before and after", ("before", "after")
 TURNS = {540: 24, 3000: 24, 24000: 24, 98304: 4}  # of threads, by size
 ROUNDS = {540: 20, 3000: 20, 24_000: 16, 98_304: 8, 405_600: 4, 1_029_000: 2}  # of one beam on a GPU
 BATCH_ROUNDS, LONG = 4, 256  # of many beams; steps without a pause
-QUICK = ("threads:540:2", "sofa:540", "steps:540", "real_time:540", "many:540:2", "vbd:540")
+QUICK = ("threads:540:2", "sofa:540", "steps:540", "real_time:540", "many:540:2", "swinging:540:2", "vbd:540")
 UNITS = (
     "threads:24000", "threads:98304", "sofa:540", "sofa:3000", "sofa:7350", "sofa:24000", "steps:24000",
     "steps:24000:heterogeneous", "steps:98304", "steps:405600", "steps:1029000", "steps:540:512", "steps:3000:256",
-    "real_time:24000", "real_time:98304", "many:540:512", "many:540:1024", "vbd:3000",
+    "real_time:24000", "real_time:98304", "many:540:512", "many:540:1024",
+    "swinging:540:512", "swinging:540:1024", "vbd:3000",
 )  # fmt: skip
-DT, VBD_DT = 0.01, 0.02  # s, of steps in real time; of the scene of Newton's VBD
+DT, VBD_DT = 0.03, 0.02  # s, of steps in real time; of the scene of Newton's VBD
 
 
 def measured(sides: Sides, unit: str, o: argparse.Namespace) -> list[Row]:
@@ -57,11 +59,16 @@ def measured(sides: Sides, unit: str, o: argparse.Namespace) -> list[Row]:
         beams = int(rest[0])
         order = {"text": Problem(tets, beams=beams).text(), "seconds": o.seconds, "first": o.first}
         return turns.in_turn(sides, kind, {"tets": tets, "beams": beams}, **order, **devices)
+    now = {SIDES[1]: sides[SIDES[1]]}  # what older checkouts do not know
+    if kind == "swinging":
+        beams = int(rest[0])
+        order = {"beams": beams, "tets": tets, "seconds": o.seconds, "first": o.first}
+        return turns.in_turn(now, kind, {"tets": tets}, **order, **devices)
     if kind == "vbd":
         text = Problem(tets, law="stable_neo_hookean", dt=VBD_DT).text().replace("rayleigh = { mass = 0.1 }\n", "")
         ours = ["integrator.linearizations=2", "solver.tolerance=1e-3"]
         exact = ["integrator.linearizations=20", "integrator.tolerance=1e-10", "solver.tolerance=1e-8"]
-        return turns.motion({SIDES[1]: sides[SIDES[1]]}, {"tets": tets}, text, ours, exact, o.device)
+        return turns.motion(now, {"tets": tets}, text, ours, exact, o.device)
     raise SystemExit(f"bench speed: unit {unit!r}; allowed: {' '.join(UNITS)} and the like")
 
 

@@ -71,7 +71,7 @@ TABLES = (
     (
         "real_time",
         "A server in real time",
-        "With one worker process on the same device, dt 10 ms. In use: from the first answer until a step used a "
+        "With one worker process on the same device, dt 30 ms. In use: from the first answer until a step used a "
         "factor. In the second half of the run: factors a second, their age in steps, ms from the beginning of the "
         "step whose matrix is factorized to that of the first step with its factor (in whole steps), ms of steps. "
         "Answers: to status queries.",
@@ -82,6 +82,12 @@ TABLES = (
         "As fast as it goes, one worker process on the same device, measured by its statuses after each body has "
         "had two factors (ready; or ten seconds). Without: bodies that had none. Ages: of the factors of the last "
         "step at each look.",
+    ),
+    (
+        "swinging",
+        "Many small bodies that keep swinging",
+        "In one process, as fast as they go, with one worker process: each is put back to its start every 100 steps "
+        "(`python -m tests.bench.gpu.many_factors`). Ages: of the factors of all steps.",
     ),
     (
         "motion",

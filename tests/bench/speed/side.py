@@ -197,6 +197,13 @@ def many(text: str, seconds: float, device: str, worker: str, first: float) -> A
         return served(written(text, folder), device, worker, seconds, first)
 
 
+def swinging(beams: int, tets: int, device: str, worker: str, first: float, seconds: float) -> Answer:
+    """Many bodies in this process that are put back again and again, with a worker process."""
+    from tests.bench.gpu.many_factors import measure
+
+    return measure(beams, tets, device, worker, first, seconds)
+
+
 def sofa(tets: int, steps: int) -> Answer:
     """SOFA's beam on one thread with a worker process, as fast as it goes: steps that had a factor."""
     from tests.bench.cpu.__main__ import with_worker
@@ -205,7 +212,8 @@ def sofa(tets: int, steps: int) -> Answer:
 
 
 ORDERS: dict[str, Callable[..., Answer]] = {
-    function.__name__: function for function in (load, drop, factor, turn, round, run, motion, real_time, many, sofa)
+    function.__name__: function
+    for function in (load, drop, factor, turn, round, run, motion, real_time, many, swinging, sofa)
 }
 
 

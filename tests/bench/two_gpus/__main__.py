@@ -72,10 +72,14 @@ def row(scene: Any, records: np.ndarray, gpus: int) -> Row:
 
 
 def write(report: Report, data: dict[str, Any]) -> None:
-    """The page. data: device, rows"""
+    """The page. data: device, rows; notes: of how some were measured"""
     device, rows = data["device"], data["rows"]
     report.data |= data
-    report.say(f"Two {device['gpu']} of one host, driver {device['driver']}, CUDA {device['CUDA']}.", WORDS)
+    report.say(
+        f"Two {device['gpu']} of one host, driver {device['driver']}, CUDA {device['CUDA']}.",
+        WORDS,
+        *data.get("notes", []),
+    )
     report.say("## Steps")
     report.table(rows)
     report.remember([r for r in rows if r["GPUs"] == 2], ("tets",), ("us p50", "faster"))
@@ -90,10 +94,16 @@ def merge(files: list[Path], out: Path | None) -> None:
         def header(self) -> dict[str, Any]:
             return parts[-1]["header"]
 
-    rows = {(r["tets"], r["GPUs"]): r for part in parts for r in part["data"]["rows"]}
+    rows = {
+        (r["tets"], r["GPUs"]): {**r, "commit": part["header"]["commit"]}
+        for part in parts
+        for r in part["data"]["rows"]
+    }
     report = Merged("two_gpus", TITLE, {"pieces": len(parts)}, out, quick=True)
     report.quick = False
-    write(report, {"device": parts[-1]["data"]["device"], "rows": [rows[key] for key in sorted(rows)]})
+    notes = [note for part in parts for note in part["data"].get("notes", [])]
+    device = parts[-1]["data"]["device"]
+    write(report, {"device": device, "rows": [rows[key] for key in sorted(rows)], "notes": notes})
 
 
 def main() -> None:

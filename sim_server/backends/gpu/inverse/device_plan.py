@@ -13,6 +13,7 @@ from sim_server.backends.gpu.inverse.halves import FarFlags
 from sim_server.backends.gpu.inverse.plan import FORM, GATHER, Plan
 from sim_server.backends.gpu.structs import PCG
 
+ALIGNMENT = 32  # entries to which the vectors of a body are aligned; 256 bytes
 PADDING = 32  # entries behind the packed vectors, to which padding refers
 TILE_SUMS: int = Declarations("backends/gpu/inverse/partitioned_inverse.cuh").constant("TILE_SUMS")
 ROUND = 6  # constant cost of a product, in chunks
@@ -168,8 +169,11 @@ class DevicePlan:
         self.address = int(self._params.data.ptr)
 
     def vectors(self) -> dict[str, DeviceArray]:
-        """Allocates the vectors of one body, as flag words (block_group.cuh) with exchange number 0."""
-        return {name: self.gpu.cp.zeros(count) for name, count in self.vector_sizes().items()}
+        """Allocates the vectors of one body, as flag words (block_group.cuh) with exchange number 0, all at once."""
+        sizes = self.vector_sizes()
+        ends = np.cumsum([-(-size // ALIGNMENT) * ALIGNMENT for size in sizes.values()]).tolist()
+        memory, begins = self.gpu.cp.zeros(ends[-1]), [0, *ends[:-1]]
+        return {name: memory[begin : begin + sizes[name]] for name, begin in zip(sizes, begins, strict=True)}
 
     def vector_sizes(self) -> dict[str, int]:
         """Returns the words of each of these vectors."""
