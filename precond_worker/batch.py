@@ -22,6 +22,7 @@ from protocol.shared_memory.view import SlotMap
 from protocol.validate import array, check_header, check_strings, parse, take
 
 ENTRY = 9  # values of a block
+LARGEST = 1 << 62  # bytes; no slot has as many
 
 
 @dataclass(eq=False)
@@ -104,8 +105,10 @@ def accept_batch(sample: zenoh.Sample, worker: str, incarnation: int) -> Batch:
         raise Refused(f"MatrixBatch.known_patterns has {len(message.known_patterns)}, not those of `known`", "shape")
     shared = sample.payload.as_shm() is not None
     batch = Batch(message, sample.payload, shared)
-    for slot, needed in ((message.matrix_slot, 8 * batch.starts[-1]), (message.factor_slot, batch.rooms[-1])):
-        if needed > slot.capacity:
+    # Summed up as Python's numbers: those of 64 bits could be exceeded, and every room must lie inside
+    needs = 8 * ENTRY * sum(message.blocks), sum(message.rooms)
+    for slot, needed in zip((message.matrix_slot, message.factor_slot), needs, strict=True):
+        if needed > min(slot.capacity, LARGEST):
             raise Refused(f"MatrixBatch has a slot of {slot.capacity} bytes; needed: {needed}", "slot")
     if any(room % ROOM_ALIGNMENT for room in message.rooms):
         raise Refused(f"MatrixBatch.rooms: not all are multiples of {ROOM_ALIGNMENT}", "slot")

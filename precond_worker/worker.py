@@ -364,7 +364,12 @@ class Worker:
         message = job.message
         analysis = self._analysis(job)
         if job.on_device:
-            values = self._factorize_on_device(job, analysis)
+            try:
+                values = self._factorize_on_device(job, analysis)
+            except Refused as refusal:
+                if refusal.kind != "late":  # the next one would fare no better
+                    self._connection.leave_device(str(refusal))
+                raise
             if values is None:
                 return
         else:
@@ -386,18 +391,14 @@ class Worker:
 
     def _factorize_on_device(self, job: Job, analysis: Factorization) -> Float64 | None:
         """Factorizes a matrix in device memory of the server, where L is written, too, and answers. Returns the matrix
-        if that must be done on the host: it may need a remedy."""
-        message, device, connection = job.message, self._connection.device, self._connection
+        if that must be done on the host: it may need a remedy. Raises Refused."""
+        message, device = job.message, self._connection.device
         dtype, size = np.dtype(message.factor_dtype), 72 * message.blocks
-        try:
-            if device is None:
-                raise Refused("Matrix.device_matrix is set, but this worker opens no device memory", "slot")
-            matrix = device.address(message.device_matrix, size)
-            room = message.device_factor.capacity
-            target = device.address(message.device_factor, min(room, analysis.pattern.nonzeros * dtype.itemsize))
-        except Refused as refusal:
-            connection.leave_device(str(refusal))
-            raise
+        if device is None:
+            raise Refused("Matrix.device_matrix is set, but this worker opens no device memory", "slot")
+        matrix = device.address(message.device_matrix, size)
+        room = message.device_factor.capacity
+        target = device.address(message.device_factor, min(room, analysis.pattern.nonzeros * dtype.itemsize))
         self._send_pattern(job, analysis.pattern)
         begin, copy = time.perf_counter(), None
         if analysis.pattern.nonzeros * dtype.itemsize <= room and isinstance(analysis, DeviceFactorization):

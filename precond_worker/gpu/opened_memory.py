@@ -76,8 +76,11 @@ class OpenedDeviceMemory:
 
     def _copy(self, to: int, source: int, size: int) -> None:
         self._device.use()
-        self._runtime.memcpyAsync(to, source, size, self._runtime.memcpyDefault, self._stream.ptr)
-        self._stream.synchronize()
+        try:
+            self._runtime.memcpyAsync(to, source, size, self._runtime.memcpyDefault, self._stream.ptr)
+            self._stream.synchronize()
+        except self._runtime.CUDARuntimeError as error:
+            raise Refused(f"DeviceSlot cannot be copied from or to: {first_line(error)}", "slot") from error
 
     def clear(self) -> None:
         """Closes all memory, when its server is gone."""

@@ -4,6 +4,7 @@
 #include <atomic>
 #include <cstdint>
 #include <cstring>
+#include <exception>
 #include <thread>
 #include <vector>
 
@@ -25,7 +26,7 @@ extern "C" {
 
 // Copies sources[i] to targets[i], of bytes[i] each; of the copies, or of what is summed up in place without targets, sums[i] is
 // the hash, and finite[i] whether all numbers of `item` bytes, 4 or 8, are finite. own_sources: that is said of the sources.
-// threads: that share the work, this one among them.
+// threads: that share the work, this one among them, if there are so many.
 void copy_all(int64_t count, const char* const* sources, char* const* targets, const int64_t* bytes, int32_t item,
               int32_t own_sources, uint64_t (*hash)(const void*, size_t), uint64_t* sums, uint8_t* finite, int32_t threads) {
     std::atomic<int64_t> next{0};
@@ -39,7 +40,10 @@ void copy_all(int64_t count, const char* const* sources, char* const* targets, c
         }
     };
     std::vector<std::thread> others;
-    for (int32_t k = 1; k < threads; k++) others.emplace_back(work);
+    try {
+        for (int32_t k = 1; k < threads; k++) others.emplace_back(work);
+    } catch (const std::exception&) {  // the system gives no more of them, or no memory: those that there are do it
+    }
     work();
     for (std::thread& each : others) each.join();
 }

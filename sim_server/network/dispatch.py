@@ -105,8 +105,9 @@ class Dispatch(FactorSource):
         """Begins a new epoch of an object; answers to jobs of the last one are refused."""
         with self._lock:
             self._book.announce(topology)
-            if self._pool is not None:
-                self._pool.prepare(72 * len(topology.columns) // 4)  # of the matrix, 3x3 numbers of 8 bytes a block
+            for slots in (self._pool, self.device):
+                if slots is not None:
+                    slots.prepare(72 * len(topology.columns) // 4)  # of the matrix, 3x3 numbers of 8 bytes a block
 
     def share_device(self, device: DeviceSlots) -> None:
         """Has matrices and factors of workers that can open it stay in device memory."""

@@ -19,7 +19,7 @@ from precond_worker.worker import Worker
 from protocol.channels import PROTOCOL, key
 from protocol.counters import Counters
 from protocol.factor import FactorPattern
-from protocol.messages_pb2 import Factor, Header, Matrix, Scene, Topology
+from protocol.messages_pb2 import DeviceSlot, Factor, Header, Matrix, Scene, Topology
 from protocol.method import Method
 from protocol.network.factor_parts import bytes_of, part_checksums
 from protocol.refused import Refused
@@ -533,6 +533,25 @@ def test_a_device_that_fails_ends_the_worker_after_an_answer(connection: FakeCon
     with pytest.raises(DeviceUnusable):
         drain(worker, connection, matrix(1))
     assert [answer.failure for answer, _ in connection.answers] == ["the GPU failed: cudaErrorIllegalAddress"]
+
+
+class Unreadable:
+    """Device memory that can be opened, and then is not there."""
+
+    def address(self, slot: DeviceSlot, size: int) -> int:
+        return 4096
+
+    def read(self, address: int, dtype: Any, count: int) -> np.ndarray:
+        raise Refused("DeviceSlot cannot be copied from or to: cudaErrorInvalidValue", "slot")
+
+
+def test_device_memory_that_cannot_be_read_is_left(worker: Worker, connection: FakeConnection) -> None:
+    """Else each job of the object would fail so."""
+    left: list[str] = []
+    connection.device, connection.leave_device = Unreadable(), left.append  # type: ignore[attr-defined]
+    slot = DeviceSlot(handle=b"h" * 64, capacity=4096, generation=1)
+    drain(worker, connection, matrix(device_matrix=slot, device_factor=slot))
+    assert [answer.failure for answer, _ in connection.answers] == left and "cannot be copied" in left[0]
 
 
 def test_a_large_factor_is_kept_to_be_asked_for_in_parts(worker: Worker, connection: FakeConnection) -> None:

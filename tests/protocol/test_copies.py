@@ -2,6 +2,8 @@
 """Many arrays that are copied and checked in one call."""
 
 import ctypes
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -64,6 +66,33 @@ def test_many_large_arrays_are_shared_by_threads(made, monkeypatch):
     targets = [np.empty_like(each) for each in sources]
     assert made.copy(sources, targets)[0] == [checksum(each) for each in sources]
     assert all((target == source).all() for source, target in zip(sources, targets, strict=True))
+
+
+NO_THREADS = """
+import ctypes, resource, sys
+import numpy as np
+from protocol.shared_memory import copies as module
+from protocol.validate import ALONE
+
+module.helping_threads = lambda: 3
+made = module.Copies(ctypes.CDLL(sys.argv[1]))
+sources = [np.full(ALONE // 8, float(k)) for k in range(3)]
+targets = [np.zeros_like(each) for each in sources]
+with open("/proc/self/statm") as file:
+    taken = int(file.read().split()[0]) * resource.getpagesize()
+before = resource.getrlimit(resource.RLIMIT_AS)
+resource.setrlimit(resource.RLIMIT_AS, (taken + (1 << 20), before[1]))  # less than a stack
+sums, finite = made.copy(sources, targets)
+resource.setrlimit(resource.RLIMIT_AS, before)
+print(all(np.array_equal(s, t) for s, t in zip(sources, targets)), sums == made.sum_up(targets)[0], all(finite))
+"""
+
+
+def test_where_the_system_gives_no_more_threads_one_copies_all():
+    """Without an end of the process."""
+    words = [sys.executable, "-c", NO_THREADS, str(build(SOURCE, stepping=False))]
+    found = subprocess.run(words, capture_output=True, text=True, timeout=120)
+    assert (found.returncode, found.stdout.split()) == (0, ["True"] * 3), found.stderr
 
 
 def test_sizes_that_differ_are_a_mistake_of_the_caller(made):

@@ -90,6 +90,14 @@ def slots_come(driver: Driver) -> None:
     driver.until(there, "slots of device memory")
 
 
+def test_the_slot_of_a_matrix_is_made_once_its_object_is_announced(memory: StandInMemory) -> None:
+    """Nobody has asked for one yet: the first job would have to travel through the host."""
+    with server(free_endpoint(), memory) as driver:
+        dispatch = driver.link.dispatch
+        driver.until(lambda: not dispatch.makes_slots(), "what is being made")
+        assert dispatch.device is not None and dispatch.device.lend([9 * 8 * 22]) is not None
+
+
 def test_matrix_and_factor_stay_on_the_device(memory: StandInMemory) -> None:
     endpoint = free_endpoint()
     with server(endpoint, memory) as driver, worker(endpoint):

@@ -72,8 +72,9 @@ class SharedDeviceMemory:
     def put(self, address: int, matrices: Sequence[PlacedMatrix]) -> None:
         """Copies matrices one after another; they are there when this returns."""
         self._device.use()
-        for values, on_device in matrices:
-            self._begin_copy(address, on_device or np.ascontiguousarray(values).ctypes.data, values.nbytes)
+        held = [each.values if each.on_device else np.ascontiguousarray(each.values) for each in matrices]
+        for values, (_, on_device) in zip(held, matrices, strict=True):
+            self._begin_copy(address, on_device or values.ctypes.data, values.nbytes)
             address += values.nbytes
         self._stream.record().synchronize()
 
@@ -82,12 +83,11 @@ class SharedDeviceMemory:
         diagonal is positive."""
         self._device.use()
         cp, count = self._gpu.cp, pattern.nonzeros
-        try:
-            made = DeviceValues(cp.empty(count, dtype))
-        except cp.cuda.memory.OutOfMemoryError:
-            return self._taken_by_host(address, pattern, dtype)
         with self._lock:
-            diagonal = self._diagonal(pattern)
+            try:
+                made, diagonal = DeviceValues(cp.empty(count, dtype)), self._diagonal(pattern)
+            except cp.cuda.memory.OutOfMemoryError:
+                return self._taken_by_host(address, pattern, dtype)
             with self._stream:
                 self._begin_copy(made.address, address, made.nbytes)
                 self._runtime.memsetAsync(self._wrong.data.ptr, 0, self._wrong.nbytes, self._stream.ptr)
