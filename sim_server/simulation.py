@@ -225,7 +225,7 @@ class Simulation:
         if self.world.explicit:
             assemble += system.keep_directions(frames=False)
         else:
-            assemble += system.finish(matrix)  # into the material frame (eq. 12 and 13)
+            assemble += system.finish(matrix, guessed=not euler)  # into the material frame (eq. 12 and 13)
         settled = self.holders.last_launches(system) if self.holders and not self.integrator.has_stages else []
         guess = [] if system.guess is None or euler else [system.guess.extrapolate()]
         return assemble, [*settled, *self.integrator.advance(), *guess]

@@ -138,19 +138,21 @@ class System:
             mean=self.mean,
         )  # fmt: skip
 
-    def finish(self, matrix: bool = True) -> list[Launch]:
+    def finish(self, matrix: bool = True, guessed: bool = True) -> list[Launch]:
         """Takes the system into the material frame, A' = R^T A R and b' = R^T b, and sets the start of the solve.
 
-        matrix: A', too. Rollers (mechanics/rollers.py) come first.
+        matrix: A', too. Rollers (mechanics/rollers.py) come first. guessed: the solve starts from the guess, which is
+        of a whole step; else from the last dv.
         """
         w = self.world
+        start = self.guess.next if self.guess and guessed else self.dv
         velocity = w.v if w.inertia else w.predictor  # without inertia v is only the last displacement over dt
         rotate = self.world.backend.module("kernels/nodes.cu").bind(
             "rotate", w.nodes, free=w.free, body=self.body, warped=self.warped, place=self.own,
             mean=self.mean, b=self.b, diagonal=self.diagonal, block=self.block, dv=self.dv,
-            guess=self.guess.next if self.guess else self.dv, x=w.x, v=velocity, extent=self.extent,
-            inverse_time=self.inverse_time, h=w.dt, whole=int(matrix), moving=self.moving,
-            rotation=self.rotation, b_material=self.b_material, last_b=self.last_b, y=self.y, values=self.values,
+            guess=start, x=w.x, v=velocity, extent=self.extent, inverse_time=self.inverse_time, h=w.dt,
+            whole=int(matrix), moving=self.moving, rotation=self.rotation, b_material=self.b_material,
+            last_b=self.last_b, y=self.y, values=self.values,
         )  # fmt: skip
         kept = self.keep_directions(frames=True)
         if not matrix:

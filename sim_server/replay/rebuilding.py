@@ -108,7 +108,8 @@ def other_code(simulation: Simulation, recording: Recording) -> list[str]:
     ]
     if scene.build and code.build_id(simulation) != scene.build:
         notes.append(
-            "another build than the recorded one (kernels, compiler, processor or GPU): last digits may differ"
+            "another build than the recorded one (kernels, compiler, processor or GPU): last digits may differ, and "
+            "where another version solves otherwise iterations, and positions within the tolerance of solves"
             + advice(scene.build)
         )
     return notes

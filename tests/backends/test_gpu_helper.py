@@ -48,6 +48,7 @@ def test_a_step_launches_the_helper_and_dismisses_it(cupy):
     ("overrides", "words"),
     [
         (["integrator.scheme=ros2"], "with scheme ros2"),
+        (["solver.preconditioner=block_jacobi"], 'with preconditioner = "block_jacobi"'),
         (["integrator.scheme=central_difference"], "with explicit steps"),
         (["object.beam.effects.cutting={ spare = 50 }"], "with bodies that may be split"),
     ],
@@ -60,6 +61,12 @@ def test_scenes_that_two_gpus_do_not_solve_are_refused(overrides, words):
 def test_small_bodies_are_refused(monkeypatch):
     monkeypatch.setattr(solver, "LEAST_NODES", 100_000)
     with pytest.raises(InputError, match=r"solver.gpus = 2: the largest object has \d+ nodes.* allowed is 1"):
+        Simulation.load("deploy/scenes/beam.toml", ["solver.gpus=2"], "gpu")
+
+
+def test_many_bodies_are_refused_whatever_the_size_of_the_largest(monkeypatch):
+    monkeypatch.setattr(solver, "threads_and_blocks", lambda *given: (128, 2))
+    with pytest.raises(InputError, match=r"solver.gpus = 2 with 1 objects, of which a multiprocessor takes several"):
         Simulation.load("deploy/scenes/beam.toml", ["solver.gpus=2"], "gpu")
 
 

@@ -56,6 +56,16 @@ def test_it_ends_where_small_steps_end():
     assert np.ptp(halved.world.x[:, 0]) > 20 and np.abs(halved.world.x - fine.world.x).max() < 0.02
 
 
+def test_short_steps_start_from_the_last_one():
+    """The guess is of a whole step, which is several times as long."""
+    sim = crushed()
+    given = sim.engine_input()
+    (whole,) = (x for x in given.assemble if x.name == "nodes.rotate")
+    short = [x for launches in given.halving.assemble for x in launches if x.name == "nodes.rotate"]
+    assert whole.arrays["guess"] is sim.system.guess.next
+    assert len(short) == 4 and all(x.arrays["guess"] is sim.system.dv for x in short)
+
+
 @pytest.mark.parametrize("threads", [1, 2])
 def test_neighbours_are_not_disturbed(threads):
     others = [bar(name=name, young=2e4, fixed="X < 0.01", touch={"max_force": 1e3}) for name in ("before", "behind")]

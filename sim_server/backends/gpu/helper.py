@@ -77,14 +77,15 @@ class Helper:
         """Returns the second GPU of a scene that asks for one. Raises InputError if it cannot help there."""
         if given.solver.gpus == 1:
             return None
-        contact = given.contact
+        contact, solver = given.contact, given.solver
         refused = {
             "scheme ros2": given.stages, "explicit steps": given.substeps,
             "contact between bodies, attachments and springs": contact and (contact.surfaces or contact.ties),
             "bodies that may be split": given.cut and given.cut.most_blocks,
+            f'preconditioner = "{solver.preconditioner}"': not solver.wants_factors,
         }  # fmt: skip
         if words := [name for name, there in refused.items() if there]:
-            raise InputError(f"solver.gpus = {given.solver.gpus} with {words[0]}: allowed is 1, one GPU does all of it")
+            raise InputError(f"solver.gpus = {solver.gpus} with {words[0]}: allowed is 1, one GPU does all of it")
         return cls(gpu, int(gpu.cp.cuda.Device().id) + 1)
 
     def __init__(self, gpu: Gpu, index: int):

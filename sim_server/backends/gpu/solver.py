@@ -188,7 +188,12 @@ class PcgSolver:
         self._helped = np.zeros(len(ranges), bool)
         if helper:
             self._helped = (nodes >= LEAST_NODES) & (assigned.first >= 0)
-            if not self._helped.any() or blocks > 1:
+            if blocks > 1:
+                raise InputError(
+                    f"solver.gpus = 2 with {len(nodes)} objects, of which a multiprocessor takes several at a time: "
+                    "allowed is 1"
+                )
+            if not self._helped.any():
                 raise InputError(
                     f"solver.gpus = 2: the largest object has {nodes.max()} nodes; two GPUs are for objects of "
                     f"{LEAST_NODES} and more, allowed is 1"
