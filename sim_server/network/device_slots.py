@@ -73,6 +73,18 @@ class DeviceSlots:
 
     def lend(self, sizes: Sequence[int]) -> list[DeviceSlot] | None:
         """Lends a slot for each of some numbers of bytes, in new generations; None if one is not there (yet)."""
+        chosen = self._chosen(sizes)
+        for slot in chosen or ():
+            self._lent.add(id(slot))
+            slot.generation += 1
+        return chosen
+
+    def prepare(self, sizes: Sequence[int]) -> None:
+        """Begins to make those slots for some numbers of bytes that are neither free nor being made."""
+        self._chosen(sizes)
+
+    def _chosen(self, sizes: Sequence[int]) -> list[DeviceSlot] | None:
+        """Returns a free slot for each of some numbers of bytes; None if one is not there, which is then being made."""
         self._take_made()
         chosen: list[DeviceSlot] = []
         missing: list[int] = []
@@ -82,20 +94,9 @@ class DeviceSlots:
                 chosen.append(min(free, key=lambda slot: slot.capacity))
             else:
                 missing.append(_rounded(size))
-        if missing:
-            for whole in missing:
-                self._begin_making(whole, missing.count(whole))
-            return None
-        for slot in chosen:
-            self._lent.add(id(slot))
-            slot.generation += 1
-        return chosen
-
-    def prepare(self, size: int) -> None:
-        """Begins to make a slot for `size` bytes, unless one is free or being made."""
-        self._take_made()
-        if not any(id(slot) not in self._lent and _fits(size, slot.capacity) for slot in self._slots):
-            self._begin_making(_rounded(size), 1)
+        for whole in missing:
+            self._begin_making(whole, missing.count(whole))
+        return None if missing else chosen
 
     def _begin_making(self, whole: int, most: int) -> None:
         """Begins to make a slot of so many bytes, unless as many are being made or the limit is reached."""

@@ -105,17 +105,14 @@ class Dispatch(FactorSource):
         """Begins a new epoch of an object; answers to jobs of the last one are refused."""
         with self._lock:
             self._book.announce(topology)
-            for slots in (self._pool, self.device):
-                if slots is not None:
-                    slots.prepare(72 * len(topology.columns) // 4)  # of the matrix, 3x3 numbers of 8 bytes a block
+            if self._pool is not None:
+                self._pool.prepare(72 * len(topology.columns) // 4)  # of the matrix, 3x3 numbers of 8 bytes a block
 
     def share_device(self, device: DeviceSlots) -> None:
         """Has matrices and factors of workers that can open it stay in device memory."""
         with self._lock:
             self.device = self._sender.device = device
             self.decoder.device = device.memory
-            for known in self.decoder.objects.values():
-                device.prepare(72 * known.blocks)
 
     def give_back(self, slot: Slot | DeviceSlot, users: int = 1) -> None:
         """Frees a slot of so many jobs that are over."""
@@ -309,4 +306,4 @@ class Dispatch(FactorSource):
     def _on_pattern(self, sample: zenoh.Sample) -> None:
         if (new := self.decoder.add_pattern(sample.key_expr, sample.payload)) is not None:
             self._patterns = [*self._patterns, new][-MAX_NEW_PATTERNS:]
-            self._sender.prepare_for(new[1])
+            self._sender.prepare_for(*new, name_in("pattern", sample.key_expr, "worker"))

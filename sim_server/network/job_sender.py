@@ -271,12 +271,15 @@ class JobSender:
         """True if a factor of so many bytes may come in a slot."""
         return self._pool is not None and size <= max(WHOLE_PARTS * PART_BYTES, self._pool.limit // SLOT_SHARE)
 
-    def prepare_for(self, pattern: FactorPattern) -> None:
-        """Has the slot for a large factor, or for its parts, made beside the caller before its first job."""
+    def prepare_for(self, object: str, pattern: FactorPattern, worker: str) -> None:
+        """Has the slot for a large factor, or for its parts, made beside the caller before its first job. Where the
+        worker that sent its pattern opens device memory, so are slots there for it and its matrix: they are kept for
+        good."""
+        size = 4 * pattern.nonzeros
         if self._pool is not None:
-            self._pool.prepare(size if self._fits_slot(size := 4 * pattern.nonzeros) else PART_BYTES)
-        if self.device is not None and 4 * pattern.nonzeros > LEAST_ON_DEVICE:
-            self.device.prepare(4 * pattern.nonzeros)
+            self._pool.prepare(size if self._fits_slot(size) else PART_BYTES)
+        if self.device is not None and size > LEAST_ON_DEVICE and self._choice.shares_device(worker):
+            self.device.prepare([72 * self._book.decoder.objects[object].blocks, size])
 
     # ---- both ------------------------------------------------------------------------------------------------
 

@@ -118,5 +118,18 @@ def test_the_slot_of_a_factor_is_made_once_its_pattern_is_known(values: int, byt
     prepared: list[int] = []
     pool = SimpleNamespace(limit=POOL_LIMIT, prepare=prepared.append)
     sender: Any = JobSender(*[None] * 2, 1, pool, *[None] * 4)  # type: ignore[arg-type]
-    sender.prepare_for(SimpleNamespace(nonzeros=values))
+    sender.prepare_for("o", SimpleNamespace(nonzeros=values), "w")
     assert prepared == [bytes_]
+
+
+@pytest.mark.parametrize("shares", [True, False])
+def test_device_memory_is_taken_only_for_a_worker_that_opens_it(shares: bool) -> None:
+    """For the matrix and the factor of the first job."""
+    prepared: list[list[int]] = []
+    book = SimpleNamespace(decoder=SimpleNamespace(objects={"o": SimpleNamespace(blocks=1000)}))
+    choice = SimpleNamespace(shares_device=lambda name: shares and name == "w")
+    sender: Any = JobSender(*[None] * 2, 1, None, *[None] * 2, book, choice)  # type: ignore[arg-type]
+    sender.device = SimpleNamespace(prepare=prepared.append)
+    sender.prepare_for("o", SimpleNamespace(nonzeros=1 << 20), "w")
+    sender.prepare_for("o", SimpleNamespace(nonzeros=100), "w")
+    assert prepared == ([[72000, 4 << 20]] if shares else [])

@@ -90,12 +90,22 @@ def slots_come(driver: Driver) -> None:
     driver.until(there, "slots of device memory")
 
 
-def test_the_slot_of_a_matrix_is_made_once_its_object_is_announced(memory: StandInMemory) -> None:
-    """Nobody has asked for one yet: the first job would have to travel through the host."""
-    with server(free_endpoint(), memory) as driver:
-        dispatch = driver.link.dispatch
-        driver.until(lambda: not dispatch.makes_slots(), "what is being made")
-        assert dispatch.device is not None and dispatch.device.lend([9 * 8 * 22]) is not None
+def test_the_first_job_of_a_pattern_that_came_ahead_is_on_the_device(memory: StandInMemory) -> None:
+    """Both of its slots are made once the pattern is known."""
+    endpoint = free_endpoint()
+    with (
+        server(endpoint, memory) as driver,
+        HandWorker(endpoint, driver.link.incarnation, shared_memory=True) as hand,
+    ):
+        hand.hello(device_memory=True)
+        driver.until(lambda: driver.link.dispatch.workers(), "the hand worker")
+        hand.right_answer(Matrix(header=hand.header("beam", 1), factor_dtype="float32"), BEAM)  # sends the pattern
+        driver.until(
+            lambda: len(memory.paths) == 3 and not driver.link.dispatch.makes_slots(), "the probe and two slots"
+        )
+        driver.submit(BEAM, 1)
+        job = hand.receive()
+        assert job.HasField("device_matrix") and job.HasField("device_factor")
 
 
 def test_matrix_and_factor_stay_on_the_device(memory: StandInMemory) -> None:
