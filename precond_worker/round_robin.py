@@ -31,7 +31,7 @@ class RoundRobin:
     def step(self, timeout: float) -> None:
         """Takes in what was received, waiting up to `timeout` seconds for it, and does one job."""
         if not any(worker.waiting for worker in self.workers):
-            self.wake.wait(timeout)
+            self.wake.wait(min([timeout, *(worker.pause for worker in self.workers)]))
         self.wake.clear()  # before the queues are read, so that nothing is missed
         for worker in self.workers:
             worker.take_in(0.0)

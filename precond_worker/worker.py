@@ -6,6 +6,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Sequence
 from itertools import groupby
+from math import inf
 from typing import Any, NamedTuple
 from weakref import WeakValueDictionary
 
@@ -33,6 +34,8 @@ from protocol.validate import array, checksum, copied, topology_checksum
 log = logging.getLogger(__name__)
 
 ANSWER_SECONDS = 3e-3  # s for which answers wait for others of their batch
+ASK_AGAIN = 0.1  # s until a server that does not tell yet what it simulates is asked again
+ASK_FOR = 60.0  # s for which it is: its name is there before its scene is made
 
 Analyse = Callable[[Int32, Int32, Method], Factorization]  # registry.make_factorization
 
@@ -76,6 +79,7 @@ class Worker:
         self._pending: dict[str, Job] = {}
         self._under_way: JobsTogether | None = None
         self._unprepared: deque[str | None] = deque()  # objects to be made ready for; None: the scene tells which
+        self._ask_at = self._ask_until = 0.0  # when it is asked for, and until when again [s, monotonic]
         self._last_end = 0.0  # when such jobs were done last [s]
         self._answers: dict[int, BatchAnswer] = {}  # by id of the batch; sent before a batch is forgotten
 
@@ -98,7 +102,12 @@ class Worker:
     def waiting(self) -> int:
         """Number of jobs taken in and not done; 1 while there is something to prepare."""
         jobs = len(self._pending) + (0 if self._under_way is None else len(self._under_way.jobs))
-        return jobs or min(len(self._unprepared), 1)
+        return jobs or int(self.pause <= 0)
+
+    @property
+    def pause(self) -> float:
+        """Time [s] until there is something to prepare; inf: there is nothing."""
+        return max(0.0, self._ask_at - time.monotonic()) if self._unprepared else inf
 
     def work(self) -> bool:
         """Does one job, or several of one pattern together; returns False if there is none."""
@@ -122,7 +131,7 @@ class Worker:
         connection, method = self._connection, Method()
         try:
             if object is None:
-                self._unprepared.extend(objects_to_prepare(connection.scene()))
+                self._unprepared.extend(self._objects_to_prepare())
                 return
             topology = connection.topology(object)
             if topology.nodes < LEAST_NODES:
@@ -137,6 +146,18 @@ class Worker:
             if exhausted(error) and not isinstance(error, MemoryError):
                 raise
             log.debug("nothing is prepared: %s", error)
+
+    def _objects_to_prepare(self) -> list[str | None]:
+        """Returns the objects that are to be made ready for; None in place of them where the server is to be asked
+        again: it does not tell yet, and has sent no job."""
+        try:
+            return [*objects_to_prepare(self._connection.scene())]
+        except Refused:
+            now = time.monotonic()
+            if self._analyses or now > self._ask_until:
+                raise
+            self._ask_at = now + ASK_AGAIN
+            return [None]
 
     def finish(self) -> None:
         """Waits for the jobs that are under way, and answers them."""
@@ -273,7 +294,7 @@ class Worker:
 
     def take_in(self, timeout: float) -> None:
         """Takes in what was received; without a waiting job, waits up to `timeout` seconds for it."""
-        for item in self._connection.received.take(0.0 if self.waiting else timeout):
+        for item in self._connection.received.take(0.0 if self.waiting else min(timeout, self.pause)):
             if isinstance(item, NameTaken):
                 raise item
             try:
@@ -306,6 +327,7 @@ class Worker:
                 self._on_server(True)
                 if self._connection.shared_memory:  # topologies are large for a network, and jobs may never come
                     self._unprepared.append(None)
+                    self._ask_at, self._ask_until = 0.0, time.monotonic() + ASK_FOR
                 return
 
     def _forget(self) -> None:

@@ -53,6 +53,7 @@ class Desk:
     def __init__(self, name: str, waiting: int, served: list[str]):
         self.name, self.waiting, self.served = name, waiting, served
         self.finished: list[str] = []  # who had been served until then, each time
+        self.pause = float("inf")
 
     def take_in(self, timeout: float) -> None:
         assert timeout == 0.0, "one server must not hold up the others"
@@ -82,6 +83,19 @@ def test_servers_with_jobs_are_served_in_turn() -> None:
         round_robin.step(0.0)
     assert sorted(served) == ["a"] * 4 + ["b", "c", "c", "d"]
     assert "b" in served[3:6], "a server that had none waits for no more than one job of each other"
+
+
+def test_it_waits_no_longer_than_until_there_is_something_to_prepare() -> None:
+    wake = threading.Event()
+    waits: list[float] = []
+    wake.wait = lambda timeout=None: bool(waits.append(timeout))  # type: ignore[method-assign, assignment]
+    round_robin, desks = RoundRobin(wake), [Desk(name, 0, []) for name in "ab"]
+    for desk in desks:
+        round_robin.add(desk)  # type: ignore[arg-type]
+    round_robin.step(9.0)
+    desks[1].pause = 0.25
+    round_robin.step(9.0)
+    assert waits == [9.0, 0.25]
 
 
 def test_the_bell_ends_the_wait() -> None:

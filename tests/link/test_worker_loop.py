@@ -12,6 +12,7 @@ from typing import Any, ClassVar
 import numpy as np
 import pytest
 
+from precond_worker import worker as worker_loop
 from precond_worker.errors import DeviceUnusable
 from precond_worker.network.presence import ServerGone, ServersThere
 from precond_worker.network.receive_queue import ReceiveQueue
@@ -223,6 +224,45 @@ def test_large_objects_are_made_ready_for_before_their_first_matrix(ahead: Worke
     asked = len(connection.asked)
     drain(ahead, connection, matrix(object="large", blocks=LARGE, omega=1.0))
     assert len(connection.asked) == asked and Ready.made == [3 * LARGE]
+
+
+def test_a_server_that_does_not_tell_yet_what_it_simulates_is_asked_again(
+    ahead: Worker, connection: FakeConnection, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A worker that was there before its server finds it while the scene is still being made."""
+    told, refusals = connection.scene, 3
+
+    def scene() -> Scene:
+        nonlocal refusals
+        refusals -= 1
+        if refusals >= 0:
+            raise Refused("the server does not tell what it simulates", "object")
+        return told()
+
+    monkeypatch.setattr(connection, "scene", scene)
+    monkeypatch.setattr(worker_loop, "ASK_AGAIN", 1000.0)
+    ahead.step(0.0)
+    assert ahead.idle and ahead.waiting == 0 and 900 < ahead.pause < 1000, "nobody waits for that"
+    monkeypatch.setattr(worker_loop, "ASK_AGAIN", 0.0)
+    ahead._ask_at = 0.0
+    while ahead.waiting:
+        ahead.step(0.0)
+    assert refusals == -1 and Ready.made == [3 * LARGE] and ahead.pause == float("inf")
+
+
+def test_a_server_that_tells_nothing_is_not_asked_after_its_first_job(
+    ahead: Worker, connection: FakeConnection, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def scene() -> Scene:
+        raise Refused("the server does not tell what it simulates", "object")
+
+    monkeypatch.setattr(connection, "scene", scene)
+    monkeypatch.setattr(worker_loop, "ASK_AGAIN", 0.0)
+    for _ in range(5):
+        ahead.step(0.0)
+    assert ahead.pause == 0.0
+    drain(ahead, connection, matrix(object="first"))
+    assert len(connection.answers) == 1 and ahead.idle and ahead.pause == float("inf")
 
 
 def test_a_job_goes_before_what_is_to_be_prepared(ahead: Worker, connection: FakeConnection) -> None:
