@@ -69,6 +69,7 @@ def test_defaults_and_resolved(tmp_path):
             "budget": 0.0,
             "on_runaway": "freeze",
             "threads": 1,
+            "gpus": 1,
             "warm_start": True,
             "woodbury": 32,
             "build": "server",

@@ -51,10 +51,11 @@ def search_row(beams: Beams, search: Search, found: Found) -> Row:
 
 def phases(beams: Beams) -> int | None:
     """Of an application of the factor that the first beam has on a GPU, a barrier each; None where there is none."""
-    plan = getattr(getattr(beams.engine, "solver", None), "plan", None)
-    if plan is None or beams.analysis is None:
+    solver = getattr(beams.engine, "solver", None)
+    if solver is None or not hasattr(solver, "plan") or beams.analysis is None:
         return None
-    return int(plan(0, beams.analysis.pattern).plan.phases)
+    planes = solver.planes or 1  # what beams get where the server chooses
+    return int(solver.plan(0, beams.analysis.pattern, planes).plan.phases)
 
 
 def _stages(records: NDArray[Any]) -> Row:
