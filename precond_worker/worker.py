@@ -78,8 +78,8 @@ class Worker:
         self._assemblers = Assemblers(connection)
         self._pending: dict[str, Job] = {}
         self._under_way: JobsTogether | None = None
-        self._unprepared: deque[str | None] = deque()  # objects to be made ready for; None: the scene tells which
-        self._ask_at = self._ask_until = 0.0  # when it is asked for, and until when again [s, monotonic]
+        self.unprepared: deque[str | None] = deque()  # objects to be made ready for; None: the scene tells which
+        self.ask_at = self._ask_until = 0.0  # when it is asked for, and until when again [s, monotonic]
         self._last_end = 0.0  # when such jobs were done last [s]
         self._answers: dict[int, BatchAnswer] = {}  # by id of the batch; sent before a batch is forgotten
 
@@ -107,16 +107,16 @@ class Worker:
     @property
     def pause(self) -> float:
         """Time [s] until there is something to prepare; inf: there is nothing."""
-        return max(0.0, self._ask_at - time.monotonic()) if self._unprepared else inf
+        return max(0.0, self.ask_at - time.monotonic()) if self.unprepared else inf
 
     def work(self) -> bool:
         """Does one job, or several of one pattern together; returns False if there is none."""
         if not self.waiting:
             return False
-        if self._unprepared and not self._pending and self._under_way is None:
-            self._prepare(self._unprepared.popleft())
+        if self.unprepared and not self._pending and self._under_way is None:
+            self._prepare(self.unprepared.popleft())
             self._done()
-            if not self._unprepared:
+            if not self.unprepared:
                 self._connection.tell()  # the server may wait for that
             return True
         try:
@@ -131,7 +131,7 @@ class Worker:
         connection, method = self._connection, Method()
         try:
             if object is None:
-                self._unprepared.extend(self._objects_to_prepare())
+                self.unprepared.extend(self._objects_to_prepare())
                 return
             topology = connection.topology(object)
             if topology.nodes < LEAST_NODES:
@@ -156,7 +156,7 @@ class Worker:
             now = time.monotonic()
             if self._analyses or now > self._ask_until:
                 raise
-            self._ask_at = now + ASK_AGAIN
+            self.ask_at = now + ASK_AGAIN
             return [None]
 
     def finish(self) -> None:
@@ -326,12 +326,12 @@ class Worker:
                 self._connection.follow(incarnation)
                 self._on_server(True)
                 if self._connection.shared_memory:  # topologies are large for a network, and jobs may never come
-                    self._unprepared.append(None)
-                    self._ask_at, self._ask_until = 0.0, time.monotonic() + ASK_FOR
+                    self.unprepared.append(None)
+                    self.ask_at, self._ask_until = 0.0, time.monotonic() + ASK_FOR
                 return
 
     def _forget(self) -> None:
-        self._unprepared.clear()
+        self.unprepared.clear()
         self._counters.add("superseded", self.waiting)
         self._pending.clear()
         under_way, self._under_way = self._under_way, None

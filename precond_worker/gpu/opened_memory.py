@@ -23,9 +23,9 @@ class OpenedDeviceMemory:
 
     def __init__(self) -> None:
         cp = cupy()
-        self._runtime, self._driver = cp.cuda.runtime, c.CDLL("libcuda.so.1")
-        self._device = cp.cuda.Device()
-        self._stream = cp.cuda.Stream(non_blocking=True)
+        self.runtime, self._driver = cp.cuda.runtime, c.CDLL("libcuda.so.1")
+        self.device = cp.cuda.Device()
+        self.stream = cp.cuda.Stream(non_blocking=True)
         self._opened: OrderedDict[bytes, tuple[int, int]] = OrderedDict()  # address and size, by handle
 
     def address(self, slot: DeviceSlot, size: int) -> int:
@@ -44,15 +44,15 @@ class OpenedDeviceMemory:
     def _open(self, handle: bytes) -> tuple[int, int]:
         found = self._opened.get(handle)
         if found is None:
-            self._device.use()
+            self.device.use()
             try:
-                address = int(self._runtime.ipcOpenMemHandle(handle))
-            except (self._runtime.CUDARuntimeError, ValueError) as error:
+                address = int(self.runtime.ipcOpenMemHandle(handle))
+            except (self.runtime.CUDARuntimeError, ValueError) as error:
                 raise Refused(f"DeviceSlot.handle cannot be opened: {first_line(error)}", "slot") from error
             base, size = c.c_uint64(), c.c_size_t()
             told = self._driver.cuMemGetAddressRange_v2(c.byref(base), c.byref(size), c.c_uint64(address))
             if told or base.value != address:
-                self._runtime.ipcCloseMemHandle(address)
+                self.runtime.ipcCloseMemHandle(address)
                 raise Refused("DeviceSlot.handle is of memory whose size cannot be told", "slot")
             found = self._opened[handle] = address, size.value
             while len(self._opened) > OPENED:
@@ -75,11 +75,11 @@ class OpenedDeviceMemory:
         self._copy(address, values.ctypes.data, values.nbytes)
 
     def _copy(self, to: int, source: int, size: int) -> None:
-        self._device.use()
+        self.device.use()
         try:
-            self._runtime.memcpyAsync(to, source, size, self._runtime.memcpyDefault, self._stream.ptr)
-            self._stream.synchronize()
-        except self._runtime.CUDARuntimeError as error:
+            self.runtime.memcpyAsync(to, source, size, self.runtime.memcpyDefault, self.stream.ptr)
+            self.stream.synchronize()
+        except self.runtime.CUDARuntimeError as error:
             raise Refused(f"DeviceSlot cannot be copied from or to: {first_line(error)}", "slot") from error
 
     def clear(self) -> None:
@@ -88,8 +88,8 @@ class OpenedDeviceMemory:
             self._close(self._opened.popitem()[1])
 
     def _close(self, opened: tuple[int, int]) -> None:
-        self._device.use()
+        self.device.use()
         try:
-            self._runtime.ipcCloseMemHandle(opened[0])
-        except self._runtime.CUDARuntimeError:  # the process that owned it may be gone
+            self.runtime.ipcCloseMemHandle(opened[0])
+        except self.runtime.CUDARuntimeError:  # the process that owned it may be gone
             return

@@ -40,10 +40,10 @@ def memory() -> SharedDeviceMemory:
         memcpyAsync=lambda to, source, size, *_: begun.append((to, source, size)), memcpyDefault=4
     )
     cuda = SimpleNamespace(memory=SimpleNamespace(OutOfMemoryError=OutOfMemoryError))
-    made._gpu = SimpleNamespace(cp=SimpleNamespace(empty=np.empty, asarray=none_left, cuda=cuda))
-    made._runtime, made._device = runtime, SimpleNamespace(use=lambda: None)
-    made._stream = SimpleNamespace(ptr=0, record=lambda: SimpleNamespace(synchronize=finish))
-    made._lock, made._diagonals, made.sums = threading.Lock(), {}, False
+    made.gpu = SimpleNamespace(cp=SimpleNamespace(empty=np.empty, asarray=none_left, cuda=cuda))
+    made.runtime, made.device = runtime, SimpleNamespace(use=lambda: None)
+    made.stream = SimpleNamespace(ptr=0, record=lambda: SimpleNamespace(synchronize=finish))
+    made._lock, made.diagonals, made.sums = threading.Lock(), {}, False
     return made
 
 
@@ -67,14 +67,14 @@ def test_what_is_copied_in_order_to_be_contiguous_is_kept_until_it_was_read(memo
         return found
 
     alive: list[bool] = []
-    record = memory._stream.record
+    record = memory.stream.record
 
     def look() -> SimpleNamespace:
         gc.collect()
         alive.extend(each() is not None for each in made)
         return record()
 
-    memory._stream.record = look
+    memory.stream.record = look
     monkeypatch.setattr(module.np, "ascontiguousarray", noted)
     matrices = [np.arange(72.0).reshape(8, 3, 3)[::2] + k for k in range(2)]
     matrices = [np.repeat(each, 2, axis=0)[::2] for each in matrices]

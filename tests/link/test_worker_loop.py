@@ -244,7 +244,7 @@ def test_a_server_that_does_not_tell_yet_what_it_simulates_is_asked_again(
     ahead.step(0.0)
     assert ahead.idle and ahead.waiting == 0 and 900 < ahead.pause < 1000, "nobody waits for that"
     monkeypatch.setattr(worker_loop, "ASK_AGAIN", 0.0)
-    ahead._ask_at = 0.0
+    ahead.ask_at = 0.0
     while ahead.waiting:
         ahead.step(0.0)
     assert refusals == -1 and Ready.made == [3 * LARGE] and ahead.pause == float("inf")
@@ -298,7 +298,7 @@ def test_what_cannot_be_prepared_is_left_for_the_first_job(
     drain(ahead, connection, matrix(object="first"))
     assert [answer.failure for answer, _ in connection.answers] == [""], "it lives on"
     monkeypatch.setattr(Ready, "error", DeviceUnusable("gone"))
-    ahead._unprepared.append("large")
+    ahead.unprepared.append("large")
     with pytest.raises(DeviceUnusable):
         ahead.step(0.0)
 

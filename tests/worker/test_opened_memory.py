@@ -25,9 +25,9 @@ def opened() -> OpenedDeviceMemory:
         ctypes.memmove(to, source, size)
 
     made = OpenedDeviceMemory.__new__(OpenedDeviceMemory)
-    made._runtime = SimpleNamespace(memcpyAsync=copy, memcpyDefault=4, CUDARuntimeError=CUDARuntimeError)
-    made._device = SimpleNamespace(use=lambda: None)
-    made._stream = SimpleNamespace(ptr=0, synchronize=lambda: None)
+    made.runtime = SimpleNamespace(memcpyAsync=copy, memcpyDefault=4, CUDARuntimeError=CUDARuntimeError)
+    made.device = SimpleNamespace(use=lambda: None)
+    made.stream = SimpleNamespace(ptr=0, synchronize=lambda: None)
     return made
 
 

@@ -31,31 +31,31 @@ class SharedDeviceMemory:
     """
 
     def __init__(self, gpu: Gpu):
-        cp, self._gpu = gpu.cp, gpu
-        self._device, self._runtime = cp.cuda.Device(), cp.cuda.runtime
-        self.limit = int(self._runtime.memGetInfo()[1]) // SHARE
-        self._stream: Stream = cp.cuda.Stream(non_blocking=True, priority=0)
+        cp, self.gpu = gpu.cp, gpu
+        self.device, self.runtime = cp.cuda.Device(), cp.cuda.runtime
+        self.limit = int(self.runtime.memGetInfo()[1]) // SHARE
+        self.stream: Stream = cp.cuda.Stream(non_blocking=True, priority=0)
         self.sums, self._summing = False, ThreadPoolExecutor(1, "checksums of factors")
         self._lock = threading.Lock()  # of what follows
         module = gpu.module("backends/gpu/check_values.cu")
         self._functions = {dtype: module.function(kernel) for dtype, kernel in KERNELS.items()}
         self._wrong: DeviceArray = cp.zeros(2, np.int32)
-        self._diagonals: dict[int, DeviceArray] = {}  # by id of the pattern, the one used last at the end
+        self.diagonals: dict[int, DeviceArray] = {}  # by id of the pattern, the one used last at the end
         cp.cuda.get_current_stream().synchronize()
 
     def allocate(self, size: int) -> Allocation | None:
         """Allocates memory for good; None if there is not enough, or no other process can open it."""
-        self._device.use()
-        free, total = self._runtime.memGetInfo()
+        self.device.use()
+        free, total = self.runtime.memGetInfo()
         if size > free - total // SHARE:
             return None
         address = 0
         try:
-            address = self._runtime.malloc(size)  # not of CuPy's pool, whose blocks hold other arrays, too
-            handle = bytes(self._runtime.ipcGetMemHandle(address))
-        except self._runtime.CUDARuntimeError:
+            address = self.runtime.malloc(size)  # not of CuPy's pool, whose blocks hold other arrays, too
+            handle = bytes(self.runtime.ipcGetMemHandle(address))
+        except self.runtime.CUDARuntimeError:
             if address:
-                self._runtime.free(address)
+                self.runtime.free(address)
             return None
         return Allocation(handle, int(address))
 
@@ -71,30 +71,30 @@ class SharedDeviceMemory:
 
     def put(self, address: int, matrices: Sequence[PlacedMatrix]) -> None:
         """Copies matrices one after another; they are there when this returns."""
-        self._device.use()
+        self.device.use()
         held = [each.values if each.on_device else np.ascontiguousarray(each.values) for each in matrices]
         for values, (_, on_device) in zip(held, matrices, strict=True):
             self._begin_copy(address, on_device or values.ctypes.data, values.nbytes)
             address += values.nbytes
-        self._stream.record().synchronize()
+        self.stream.record().synchronize()
 
     def take(self, address: int, pattern: FactorPattern, dtype: np.dtype[Any]) -> Any:
         """Returns a copy of the values of a factor (DeviceValues). Raises Refused unless they are finite and their
         diagonal is positive."""
-        self._device.use()
-        cp, count = self._gpu.cp, pattern.nonzeros
+        self.device.use()
+        cp, count = self.gpu.cp, pattern.nonzeros
         with self._lock:
             try:
                 made, diagonal = DeviceValues(cp.empty(count, dtype)), self._diagonal(pattern)
             except cp.cuda.memory.OutOfMemoryError:
                 return self._taken_by_host(address, pattern, dtype)
-            with self._stream:
+            with self.stream:
                 self._begin_copy(made.address, address, made.nbytes)
-                self._runtime.memsetAsync(self._wrong.data.ptr, 0, self._wrong.nbytes, self._stream.ptr)
-                blocks = min(-(-count // THREADS), BLOCKS * int(self._gpu.properties["multiProcessorCount"]))
+                self.runtime.memsetAsync(self._wrong.data.ptr, 0, self._wrong.nbytes, self.stream.ptr)
+                blocks = min(-(-count // THREADS), BLOCKS * int(self.gpu.properties["multiProcessorCount"]))
                 arguments = np.uint64(made.address), np.int64(count), diagonal, np.int32(pattern.size), self._wrong
                 self._functions[dtype.name]((blocks,), (THREADS,), arguments)
-                infinite, below = self._wrong.get(stream=self._stream).tolist()  # waits
+                infinite, below = self._wrong.get(stream=self.stream).tolist()  # waits
         if infinite:
             raise Refused("Factor values hold NaN or infinite numbers; allowed: finite", "not_finite")
         if below:
@@ -111,29 +111,29 @@ class SharedDeviceMemory:
 
     def _sum(self, values: DeviceValues) -> int:
         """Returns the checksum of values, in a thread."""
-        self._device.use()
-        stream = self._gpu.cp.cuda.Stream(non_blocking=True)
-        host = pinned_array(self._gpu.cp, values.size, values.dtype)
-        kind = self._runtime.memcpyDeviceToHost
-        self._runtime.memcpyAsync(host.ctypes.data, values.address, host.nbytes, kind, stream.ptr)
+        self.device.use()
+        stream = self.gpu.cp.cuda.Stream(non_blocking=True)
+        host = pinned_array(self.gpu.cp, values.size, values.dtype)
+        kind = self.runtime.memcpyDeviceToHost
+        self.runtime.memcpyAsync(host.ctypes.data, values.address, host.nbytes, kind, stream.ptr)
         stream.synchronize()
         return checksum(host)
 
     def _diagonal(self, pattern: FactorPattern) -> DeviceArray:
         """Returns FactorPattern.diagonal on the device."""
-        found = self._diagonals.pop(pattern.id, None)
+        found = self.diagonals.pop(pattern.id, None)
         if found is None:
-            found = self._gpu.cp.asarray(pattern.diagonal.astype(np.int64))
-            self._gpu.cp.cuda.get_current_stream().synchronize()
-        self._diagonals[pattern.id] = found
-        while len(self._diagonals) > MOST_PATTERNS:
-            del self._diagonals[next(iter(self._diagonals))]
+            found = self.gpu.cp.asarray(pattern.diagonal.astype(np.int64))
+            self.gpu.cp.cuda.get_current_stream().synchronize()
+        self.diagonals[pattern.id] = found
+        while len(self.diagonals) > MOST_PATTERNS:
+            del self.diagonals[next(iter(self.diagonals))]
         return found
 
     def _copy(self, to: int, source: int, size: int) -> None:
-        self._device.use()
+        self.device.use()
         self._begin_copy(to, source, size)
-        self._stream.record().synchronize()
+        self.stream.record().synchronize()
 
     def _begin_copy(self, to: int, source: int, size: int) -> None:
-        self._runtime.memcpyAsync(to, source, size, self._runtime.memcpyDefault, self._stream.ptr)
+        self.runtime.memcpyAsync(to, source, size, self.runtime.memcpyDefault, self.stream.ptr)
