@@ -30,9 +30,8 @@ from sim_server.updates.factor_source import Job
 
 FAST_SEND = 0.05  # s in which a fast link takes a job as bytes; zenoh drops what is not taken within 0.25 s
 BEHIND = 10.0  # s of a lease, at most, for what waits at a worker behind a first job, which has a longer one
-LEAST_ON_DEVICE = (
-    1 << 20
-)  # bytes of a factor; what has no more crosses the host in less time than the device needs to answer
+LEAST_ON_DEVICE = 1 << 20
+"""Bytes of a factor; what has no more crosses the host in less time than the device needs to answer."""
 MAX_SENT = 4096  # times of jobs that are remembered
 SLOT_MARGIN = 8  # the slot for an incomplete factor is larger than the largest factor so far by a SLOT_MARGIN-th
 

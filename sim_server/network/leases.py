@@ -200,30 +200,31 @@ class Leases:
 
         seconds: duration of the factorization; None if it failed
         """
-        if self.by_object.get(job.object) is job:
-            del self.by_object[job.object]
-        self._drop([job])
-        self._reassigned.discard(job.number)
-        self._free_slots([job])
-        self._free_expired(job.worker, job.number)
+        self._end([job])
         if seconds is not None:
-            self._seconds.setdefault(job.object, {})[job.worker] = seconds
-            self._answered.setdefault((job.object, job.worker), set()).add((job.method, job.positions))
-            self._doublings.pop((job.object, job.worker), None)
+            self._remember(job, seconds)
 
     def finish_all(self, jobs: Sequence[InFlightJob], seconds: Sequence[float]) -> None:
         """Removes jobs of one worker that it has answered with factors in one message, as `finish` does each."""
-        worker = jobs[0].worker
+        self._end(jobs)
         for job, lasted in zip(jobs, seconds, strict=True):
+            self._remember(job, lasted)
+
+    def _end(self, jobs: Sequence[InFlightJob]) -> None:
+        """Removes answered jobs of one worker, and frees all of its slots up to the last one."""
+        for job in jobs:
             if self.by_object.get(job.object) is job:
                 del self.by_object[job.object]
-            self._seconds.setdefault(job.object, {})[worker] = lasted
-            self._answered.setdefault((job.object, worker), set()).add((job.method, job.positions))
-            self._doublings.pop((job.object, worker), None)
         self._drop(jobs)
         self._reassigned.difference_update(job.number for job in jobs)
         self._free_slots(jobs)
-        self._free_expired(worker, max(job.number for job in jobs))
+        self._free_expired(jobs[0].worker, max(job.number for job in jobs))
+
+    def _remember(self, job: InFlightJob, seconds: float) -> None:
+        """Takes note of how long a factorization took, by which later leases go."""
+        self._seconds.setdefault(job.object, {})[job.worker] = seconds
+        self._answered.setdefault((job.object, job.worker), set()).add((job.method, job.positions))
+        self._doublings.pop((job.object, job.worker), None)
 
     def expire(self, now: float, is_answered: Callable[[InFlightJob], bool] = lambda job: False) -> list[InFlightJob]:
         """Ends the leases that are over: objects and workers are free again, the slots are not. Returns the jobs.

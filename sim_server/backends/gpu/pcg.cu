@@ -419,12 +419,7 @@ struct PcgSolver {
         double mine[4] = {0, 0, 0, 0};
         rows.multiply([&](int node, int c, real q) {
             const int k = 3 * node + c;
-            const double p = rows.values[k], r = rows.r[k], qk = q;
-            mine[0] += p * qk;
-            mine[1] += r * qk;
-            mine[2] += qk * qk;
-            mine[3] += r * r;
-            rows.q[k] = q;
+            rows.keep_product(k, q, mine);
             if (packed) publish_product(k, q);
         });
         q_number = group.number;

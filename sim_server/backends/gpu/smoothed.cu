@@ -161,15 +161,7 @@ struct SmoothedSolver {
         __syncthreads();  // z has been read
         receive(memory.inverse.product, 0);
         double mine[4] = {0, 0, 0, 0};
-        rows.multiply([&](int node, int c, real q) {
-            const int k = 3 * node + c;
-            const double p = rows.values[k], r = rows.r[k], qk = q;
-            mine[0] += p * qk;
-            mine[1] += r * qk;
-            mine[2] += qk * qk;
-            mine[3] += r * r;
-            rows.q[k] = q;
-        });
+        rows.multiply([&](int node, int c, real q) { rows.keep_product(3 * node + c, q, mine); });
         for (int n = 0; n < 4; ++n) mine[n] = warp_sum(mine[n]);
         group.sums<4, 1>(mine, out);
     }

@@ -323,6 +323,16 @@ struct BlockRows {
     }
 #endif
 
+    // Keeps entry k of q = A p, p being `values`, and adds what it is to the sums p.q, r.q, q.q and r.r.
+    __device__ __forceinline__ void keep_product(int k, real product, double (&sums)[4]) const {
+        const double p = values[k], residual = r[k], qk = product;
+        sums[0] += p * qk;
+        sums[1] += residual * qk;
+        sums[2] += qk * qk;
+        sums[3] += residual * residual;
+        q[k] = product;
+    }
+
     // q = A values for the own nodes. done(node, c, q): entry c of a node's, called by as many lanes as there are.
     template <class Done>
     __device__ __forceinline__ void multiply(Done done) const {
