@@ -63,9 +63,7 @@ class Pieces:
         self._path, self._compression, self._rotation = path, compression, rotation
         self._run, self._number = secrets.token_hex(8), 1
         self._kept, self.repeated = Kept(rotation), Repeated()
-        for _, piece in later_pieces(path):
-            if is_locked(piece):
-                raise InputError(is_written(piece))
+        refuse_written(path)
         self._file = McapFile(path, compression, overwrite, self._origin(0))
         self._regular = self._file.regular
         self._first: int | None = None
@@ -106,9 +104,13 @@ class Pieces:
         """Checks that the file is still there, begins a new one if it is due, keeps the budget. notes: as `finish`"""
         self._file.check_exists()
         if self._regular and self._records and self._rotation.due(self._file.size, time.monotonic() - self._begun):
-            self.finish(notes)
-            self._kept.add(self.path, self._file_size)
-            self._begin(self.repeated.records(), repeats=True)
+            ended = self._file.duplicate()  # keeps the log locked until the next file is
+            try:
+                self.finish(notes)
+                self._kept.add(self.path, self._file_size)
+                self._begin(self.repeated.records(), repeats=True)
+            finally:
+                os.close(ended)
         self._kept.keep_budget(self._file.size)
 
     def finish(self, notes: dict[str, int]) -> None:
@@ -166,3 +168,13 @@ class Pieces:
             self._put(record)
         self._file.flush()
         self._records = 0
+
+
+def refuse_written(path: Path) -> None:
+    """Raises InputError if another process writes a later file of a log; its first one need not be there any more."""
+    looked: list[tuple[int, Path]] | None = None
+    while looked != (now := later_pieces(path)):  # it may have begun the next file meanwhile
+        looked = now
+        for _, piece in reversed(now):
+            if is_locked(piece):
+                raise InputError(is_written(piece))

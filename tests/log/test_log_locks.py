@@ -4,6 +4,7 @@
 import os
 import time
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -11,7 +12,7 @@ from clients.log.reader import Log
 from protocol import messages_pb2 as pb
 from protocol.log_pieces import later_pieces
 from sim_server.errors import InputError
-from sim_server.recording import file_lock
+from sim_server.recording import file_lock, pieces
 from sim_server.recording.recorder import Recorder
 from sim_server.recording.rotation import Kept, Rotation
 
@@ -52,6 +53,21 @@ def test_a_log_in_pieces_is_locked_as_a_whole(tmp_path: Path, first_is_there: bo
         assert later_pieces(path)
     with recorder(path):
         pass
+
+
+def test_a_log_stays_locked_while_its_next_file_is_begun(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path, locked = tmp_path / "run.mcap", []
+
+    class Begun(pieces.McapFile):
+        def __init__(self, new: Path, *options: Any) -> None:
+            locked.append([file_lock.is_locked(piece) for _, piece in later_pieces(path)])
+            super().__init__(new, *options)
+
+    monkeypatch.setattr(pieces, "McapFile", Begun)
+    with recorder(path, rotation=Rotation(bytes=1e6)) as written:
+        for k in range(32):
+            written.interaction(pb.Interaction(object="beam", held=os.urandom(1 << 18)), 0.1 * k, block=True)
+    assert len(locked) > 3 and all(newest for *_, newest in locked[2:])
 
 
 def test_a_budget_removes_no_log_that_somebody_writes(tmp_path: Path) -> None:
