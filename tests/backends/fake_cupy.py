@@ -7,6 +7,7 @@ while decisions of kernels are those that a test gives in their place.
 """
 
 import ctypes as c
+import itertools
 import re
 import sys
 from collections.abc import Callable, Iterator, Sequence
@@ -146,6 +147,7 @@ def made(folder: Path, library: Any) -> ModuleType:
     cp.calls, cp.pending, cp.compiled, cp.ran = [], 0, set(), []
     kernels: dict[str, Callable[..., None]] = {"accept_trial": end_search}
     compiled, cp.kernels, Stream.graphs = cp.compiled, kernels, Graphs()
+    numbers = itertools.count()  # of files: threads compile at the same time
 
     class CurrentStream(Stream):
         def synchronize(self) -> None:
@@ -177,7 +179,7 @@ def made(folder: Path, library: Any) -> ModuleType:
 
         def get_function(self, kernel: str) -> Function:
             if (self.code, self.options) not in compiled:
-                text = folder / f"text{len(compiled)}.cu"
+                text = folder / f"text{next(numbers)}.cu"
                 text.write_text(self.code)
                 code, said = nvrtc.compiled(library, text, ["-arch=sm_90", "--Ofast-compile=max", *self.options])
                 if not code:

@@ -110,7 +110,7 @@ def test_it_shows_the_body_and_what_the_server_does(world: World, tab: Any) -> N
     choose_colour(tab, "von Mises stress")
     tab.get_by_text("von Mises stress: 0 (violet)").wait_for()
     tab.get_by_text("iterations of a step").wait_for()
-    tab.get_by_role("cell", name="converged").wait_for()
+    tab.get_by_role("cell", name="at rest").wait_for()
 
 
 def test_a_drag_moves_the_body_and_letting_go_releases_it(world: World, tab: Any) -> None:
