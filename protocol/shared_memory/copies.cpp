@@ -25,7 +25,8 @@ bool all_finite(const char* data, int64_t bytes) {
 extern "C" {
 
 // Copies sources[i] to targets[i], of bytes[i] each; of the copies, or of what is summed up in place without targets, sums[i] is
-// the hash, and finite[i] whether all numbers of `item` bytes, 4 or 8, are finite. own_sources: that is said of the sources.
+// the hash, and finite[i] whether all numbers of `item` bytes, 4 or 8, are finite (null: not looked at). own_sources: that is
+// said of the sources.
 // threads: that share the work, this one among them, if there are so many.
 void copy_all(int64_t count, const char* const* sources, char* const* targets, const int64_t* bytes, int32_t item,
               int32_t own_sources, uint64_t (*hash)(const void*, size_t), uint64_t* sums, uint8_t* finite, int32_t threads) {
@@ -34,8 +35,9 @@ void copy_all(int64_t count, const char* const* sources, char* const* targets, c
         for (int64_t i = next++; i < count; i = next++) {
             if (targets) std::memcpy(targets[i], sources[i], size_t(bytes[i]));
             const char* own = own_sources || !targets ? sources[i] : targets[i];
-            finite[i] = item == 8 ? all_finite<uint64_t, 0x7ff0000000000000u>(own, bytes[i])
-                                  : all_finite<uint32_t, 0x7f800000u>(own, bytes[i]);
+            if (finite)
+                finite[i] = item == 8 ? all_finite<uint64_t, 0x7ff0000000000000u>(own, bytes[i])
+                                      : all_finite<uint32_t, 0x7f800000u>(own, bytes[i]);
             sums[i] = hash(own, size_t(bytes[i]));
         }
     };
