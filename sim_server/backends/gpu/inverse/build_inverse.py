@@ -34,6 +34,7 @@ from sim_server.backends.gpu.inverse.plan import Plan
 from sim_server.backends.gpu.inverse.workspace import workspace
 from sim_server.backends.gpu.pinned import is_pinned, runs
 
+FLOAT32 = np.dtype(np.float32)
 ALIGNMENT = 64  # numbers; 256 bytes, as of what is allocated alone
 HEAD = BUILDS.itemsize  # bytes in front of the values: struct Builds
 COUNTS = (1, 4, 16, MOST_BUILDS)  # of inverses, for which graphs are made
@@ -178,7 +179,7 @@ class InverseBuilder:
         size = HEAD + 4 * count * self._nonzeros
         graph, stream = self._graph(multiprocessors, next(c for c in COUNTS if c >= count)), space.stream
         at, copy, kind = int(space.incoming.data.ptr), cp.cuda.runtime.memcpyAsync, cp.cuda.runtime.memcpyHostToDevice
-        if all(each.dtype == np.float32 and is_pinned(each) for each in values):
+        if all(each.dtype == FLOAT32 and is_pinned(each) for each in values):
             copy(at, space.staging.ctypes.data, HEAD, kind, stream.ptr)
             for begin, source, length in runs(values):
                 copy(at + HEAD + begin, source, length, cp.cuda.runtime.memcpyDefault, stream.ptr)
