@@ -4,6 +4,7 @@
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import cache
 from weakref import WeakValueDictionary
 
 import numpy as np
@@ -364,6 +365,11 @@ def _slot(job: InFlightJob) -> Slot:
     return job.factor_slot
 
 
+@cache
+def _item_bytes(dtype: str) -> int:
+    return np.dtype(dtype).itemsize
+
+
 def _check_slot(given: tuple[str, int, int], nonzeros: int, job: InFlightJob) -> int:
     """Returns the bytes of a factor that fits into the slot allocated for its job, and is said to be there."""
     slot = job.factor_slot
@@ -372,7 +378,7 @@ def _check_slot(given: tuple[str, int, int], nonzeros: int, job: InFlightJob) ->
     allocated = (slot.segment, slot.offset, job.factor_generation)
     if given != allocated:
         raise Refused(f"Factor.slot is {given}; allowed: {allocated}, as lent for this job", "slot")
-    size, room = nonzeros * np.dtype(job.dtype).itemsize, job.room or slot.capacity
+    size, room = nonzeros * _item_bytes(job.dtype), job.room or slot.capacity
     if size > room:
         raise Refused(f"Factor.nonzeros is {nonzeros}: {size} bytes in a slot of {room}", "slot")
     return size

@@ -286,7 +286,7 @@ def test_answers_of_no_job_and_second_answers_are_refused_one_by_one(stage: Hand
 
 def test_large_batches_are_decoded_beside_the_caller(stage: Hand, monkeypatch: pytest.MonkeyPatch) -> None:
     """All count as large here. Meanwhile nothing is taken and second answers are refused; then each counts alone."""
-    monkeypatch.setattr(factor_intake, "LARGE", 0)
+    monkeypatch.setattr(factor_intake, "LARGE_MESSAGE", 0)
     batch, go = stage.batch(), threading.Event()
     decode, before = stage.driver.link.dispatch.decoder.decode_several, stage.driver.link.counters.refusals["duplicate"]
 
