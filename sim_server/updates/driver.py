@@ -32,7 +32,7 @@ from sim_server.updates.policies import make_policy
 from sim_server.updates.scheduler import UpdateRequests
 from sim_server.updates.snapshots import SnapshotPool
 from sim_server.updates.solve_observer import SolveObserver
-from sim_server.updates.update_table import NONE, UpdateTable
+from sim_server.updates.update_table import NONE, UpdateTable, told
 from sim_server.updates.useless_factors import UselessFactors
 
 log = logging.getLogger(__name__)
@@ -153,8 +153,10 @@ class Driver:
 
     def observe(self, records: NDArray[Any]) -> None:
         """Sums up what solves cost, lets `auto` choose, drops useless factors."""
-        self._observer.observe(records)
-        self.useless_factors.observe(records)
+        records = np.ascontiguousarray(records)
+        tells = told(records)
+        self._observer.observe(records, tells)
+        self.useless_factors.observe(records, tells)
 
     # --- matrices out -------------------------------------------------------------------------------------------
 
@@ -165,23 +167,10 @@ class Driver:
             whose next matrix may go ahead of it, one alone: there are two places for copies. It does where factors
             have been of use and `auto` compares none
         """
-        t, step = self.table, self.engine.step
         tuners = [state.tuner for state in self.bodies] if self._tuned else []
-        on_trial = np.array([t is not None and t.wants_factor for t in tuners] or [False] * len(self.bodies))
-        age = np.where((t.newest >= 0) & ~t.dropped, step - t.newest, NONE)
-        iteration_cost, cost = (np.where(np.isnan(each), 1.0, each) for each in (t.iteration_cost, t.cost))
-        waited = np.where(t.sent >= 0, step - t.sent, NONE)
-        checked = t.checked != NONE
-        on_its_way = t.in_flight | t.copying | (False if ahead else checked)
-        every = UpdateRequests(
-            np.arange(len(t)), t.excess, waited, on_its_way, age, iteration_cost, cost, t.failures, t.lost, on_trial,
-            t.latest,
-        )  # fmt: skip
-        if not ahead:
-            return every.of(~t.frozen)
-        compared = np.array([t is not None and t.factorization.candidate is not None for t in tuners] or False)
-        last = checked & (t.sent == t.checked)
-        return every.of(last & ~t.frozen & (age >= 0) & (t.failures == 0) & ~compared)
+        on_trial = [t is not None and t.wants_factor for t in tuners]
+        compared = [t is not None and t.factorization.candidate is not None for t in tuners]
+        return UpdateRequests(**self.table.requests(self.engine.step, ahead, on_trial, compared))
 
     def make_job(self, state: BodyUpdateState) -> Job | None:
         """Returns the job of the copy that the loop has made for a body. None: the copy does not suffice and is
