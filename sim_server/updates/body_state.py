@@ -187,7 +187,9 @@ class FactorStatistics:
     def note(self, factor: Factor, cost: float) -> None:
         """Remembers of a factor what stands in no table."""
         if method := self.method(factor.step):
-            self.cost_by_method.setdefault(method.name, RunningMean()).add(cost)
+            if (mean := self.cost_by_method.get(method.name)) is None:
+                mean = self.cost_by_method[method.name] = RunningMean()
+            mean.add(cost)
         _remember(self.workers, factor.step, factor.worker)
         self.regularized += bool(factor.remedy)
 
@@ -231,9 +233,7 @@ class BodyUpdateState:
     def on_check(self, step: int) -> None:
         """Takes note that the factor of `step` has come and is checked beside the steps: the next matrix may be sent
         meanwhile."""
-        self.job.checked = step
-        if step == self.job.sent:
-            self.job.in_flight = False
+        on_checks(self._table, [self], [step])
 
     def on_factor(self, factor: Factor, step: int) -> bool:
         """Takes note of a factor that came during `step`; False if a newer one is there already."""
@@ -312,6 +312,13 @@ def on_sent(table: UpdateTable, rows: Sequence[int], steps: Sequence[int]) -> No
     row = np.asarray(rows, np.int64)
     table.in_flight[row], table.copying[row], table.sent[row] = True, False, steps
     table.excess_sent[row], table.excess[row] = table.excess[row], 0.0
+
+
+def on_checks(table: UpdateTable, states: Sequence[BodyUpdateState], steps: Sequence[int]) -> None:
+    """Takes note that factors of some steps have come, which are checked beside the steps. table: that of the states"""
+    row, made = np.array([state._index for state in states]), np.asarray(steps)
+    table.checked[row] = made
+    table.in_flight[row] &= table.sent[row] != made
 
 
 def on_factors(

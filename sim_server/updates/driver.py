@@ -24,7 +24,7 @@ from sim_server.backends.base import Capability
 from sim_server.backends.cpu.structs import REACTION
 from sim_server.mechanics.world import Body
 from sim_server.simulation import Simulation
-from sim_server.updates.body_state import BodyUpdateState, on_factors
+from sim_server.updates.body_state import BodyUpdateState, on_checks, on_factors
 from sim_server.updates.factor_check import FactorCheck
 from sim_server.updates.factor_source import FactorSource, Inline, Job
 from sim_server.updates.patterns import Patterns
@@ -172,22 +172,23 @@ class Driver:
         compared = [t is not None and t.factorization.candidate is not None for t in tuners]
         return UpdateRequests(**self.table.requests(self.engine.step, ahead, on_trial, compared))
 
-    def make_job(self, state: BodyUpdateState) -> Job | None:
+    def make_job(self, state: BodyUpdateState, step: int | None = None) -> Job | None:
         """Returns the job of the copy that the loop has made for a body. None: the copy does not suffice and is
-        discarded."""
-        assert state.job.copy is not None
-        if self.snapshots.suffices(state) and self._is_present(state):
-            step = self.snapshots.step(state)
-            return self._job(state, step, state.job.copy, self.engine.staged_matrix(state.body.index))
+        discarded. step: of the copy, where that is known"""
+        copy = state.job.copy
+        assert copy is not None
+        step = self.snapshots.step(state) if step is None else step
+        if self.snapshots.suffices(state, step) and self._is_present(state, step):
+            return self._job(state, step, copy, self.engine.staged_matrix(state.body.index))
         self.snapshots.discard(state)
         return None
 
-    def _is_present(self, state: BodyUpdateState) -> bool:
+    def _is_present(self, state: BodyUpdateState, step: int) -> bool:
         """False if the copy is of a matrix from before the body was split for the last time, or after it."""
         s, body = self.simulation, state.body
         if s.splits is None:
             return True
-        epoch = s.epoch(body.name, self.snapshots.step(state))
+        epoch = s.epoch(body.name, step)
         blocks = int(s.system.row_start[body.last] - s.system.row_start[body.first])
         return epoch == s.epoch(body.name, s.engine.step) and blocks == len(self._patterns.at(body.name, epoch)[1])
 
@@ -257,13 +258,13 @@ class Driver:
         """False while a factor of the body is checked, or a large one could not be made ready at once: the checks of
         others would wait for it."""
         large = factor.values.nbytes > LARGE
-        return state.job.checked == NONE and (not large or self.engine.may_prepare(state.body.index))
+        return self.table.checked[state.body.index] == NONE and (not large or self.engine.may_prepare(state.body.index))
 
     def _check_beside(self, factors: Sequence[Factor]) -> None:
-        held = [self.snapshots.hold(self.by_name[f.object], f.step) for f in factors]
+        states = [self.by_name[factor.object] for factor in factors]
+        held = [self.snapshots.hold(state, factor.step) for state, factor in zip(states, factors, strict=True)]
         checked = [(factor, matrix) for factor, (_, matrix) in zip(factors, held, strict=True)]
-        for factor in factors:
-            self.by_name[factor.object].on_check(factor.step)
+        on_checks(self.table, states, [factor.step for factor in factors])
         applied = self._prepare(factors[0]) if len(factors) == 1 else None
         reasons = self._checker.submit(self.check.reject_reasons, checked, applied)
         reasons.add_done_callback(lambda _: self.wake())

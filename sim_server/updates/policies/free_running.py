@@ -149,7 +149,7 @@ class Async(UpdatePolicy):
                 if now - step > self.prefetch.patience:
                     driver.snapshots.discard(state)
                 continue
-            if (job := driver.make_job(state)) is not None:
+            if (job := driver.make_job(state, step)) is not None:
                 made.append((state, job))
         self.prefetch.on_sent(len(made), time.monotonic())
         if not made:
