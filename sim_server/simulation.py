@@ -181,7 +181,7 @@ class Simulation:
         """From a scene file. Raises InputError, also for one beyond the limits."""
         scene = load(path, overrides)
         try:
-            limits.check(scene)
+            limits.check(scene, backends.bytes_of_copies(device, scene.solver.precision))
             return cls(scene, device)
         except DeviceError:
             raise

@@ -248,6 +248,8 @@ class Dispatch(FactorSource):
                 self._on_message[channel](sample)
             except Refused as refusal:
                 self._counters.refuse(refusal)
+            except Exception as error:  # whatever a message holds, the run goes on
+                self._counters.refuse(self._counters.unexpected(error, f"a message {str(sample.key_expr)[:200]!r}"))
         self._intake.take_decoded()
         self._sender.give_back_sent()
         self._query_tokens()

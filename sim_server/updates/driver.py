@@ -251,7 +251,7 @@ class Driver:
             self._check_beside(together)
         elif together:
             at_once = [(f, self.snapshots.release(self.by_name[f.object], f.step)) for f in together]
-            self._take_up(together, self.check.reject_reasons(at_once))
+            self._take_up(together, self._reject_reasons(at_once))
         self.policy.on_job_end()
 
     def _may_check(self, state: BodyUpdateState, factor: Factor) -> bool:
@@ -266,9 +266,20 @@ class Driver:
         checked = [(factor, matrix) for factor, (_, matrix) in zip(factors, held, strict=True)]
         on_checks(self.table, states, [factor.step for factor in factors])
         applied = self._prepare(factors[0]) if len(factors) == 1 else None
-        reasons = self._checker.submit(self.check.reject_reasons, checked, applied)
+        reasons = self._checker.submit(self._reject_reasons, checked, applied)
         reasons.add_done_callback(lambda _: self.wake())
         self.checks.append(FactorsUnderCheck(factors, [memory for memory, _ in held], reasons))
+
+    def _reject_reasons(
+        self, checked: Sequence[tuple[Factor, Float64 | None]], applied: Callable[[], Float64 | None] | None = None
+    ) -> list[str]:  # fmt: skip
+        """Returns what FactorCheck.reject_reasons does. Whatever error it raises, none of the factors is used, and the
+        run goes on. From any thread."""
+        try:
+            return self.check.reject_reasons(checked, applied)
+        except Exception as error:
+            log.debug("the check of factors failed", exc_info=error)
+            return [f"its check failed: {type(error).__name__}: {error}" for _ in checked]
 
     def _prepare(self, factor: Factor) -> Callable[[], Float64 | None] | None:
         """Has a large factor made ready for use while it is checked, and applied for the check."""

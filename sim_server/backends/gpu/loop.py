@@ -28,6 +28,18 @@ DOUBLED = 512 << 20  # bytes of the matrices of all bodies, up to which each has
 POLL = 1e-5  # interval between queries of an event [s]
 
 
+def places_of_copies(size: int) -> int:
+    """Returns for how many copies of the matrix of each body the loop has page-locked memory. size: bytes of the
+    matrices of all bodies"""
+    return 2 if size <= DOUBLED else 1
+
+
+def bytes_of_copies(blocks: Sequence[float], real: DTypeLike) -> float:
+    """Returns the bytes of that memory. blocks: of 3x3 numbers of type `real` in the matrix of each body"""
+    size = 9 * np.dtype(real).itemsize * sum(blocks)
+    return places_of_copies(int(size)) * size
+
+
 class LoopDevice(Protocol):
     """A GPU as the loop uses it; handles are integers.
 
@@ -102,8 +114,9 @@ class DeviceLoop(Reports):
         self._readbacks, block = (structs.BodyReadback * bodies)(), 9 * np.dtype(real).itemsize
         most = most_blocks or [int(row_start[last] - row_start[first]) for first, last in ranges]
         self._room = [block * count for count in most]  # bytes of the blocks of each body at most
-        self._places = sum(self._room) <= DOUBLED  # two for the copies of each body
-        staged = np.cumsum([0, *((1 + self._places) * room for room in self._room)])
+        places = places_of_copies(sum(self._room))
+        self._doubled = places == 2
+        staged = np.cumsum([0, *(places * room for room in self._room)])
         self._staged_begin = [int(begin) for begin in staged]  # of the first one of each
         for entry, (first, last), own in zip(self._readbacks, ranges, staged, strict=False):
             begin, end = block * int(row_start[first]), block * int(row_start[last])
@@ -259,7 +272,7 @@ class DeviceLoop(Reports):
     def copy_memory(self, body: int) -> Float64 | None:
         """Returns page-locked memory that the next copy of a body's matrix is brought to, (blocks, 3, 3), and that the
         one behind it leaves alone; None: where matrices are large, or of another type."""
-        if self._real != np.float64 or not self._places:
+        if self._real != np.float64 or not self._doubled:
             return None
         place = self._other_place(body)
         if (own := self._own_memory.get(place)) is None:
@@ -288,7 +301,7 @@ class DeviceLoop(Reports):
         self._staging()
         if target is not self.copy_memory(body):
             self._targets[body] = target
-        if self._places:
+        if self._doubled:
             self._staged_at[body] = self._other_place(body)
         self._copied_steps[body] = -1
         self._requests[body] = request  # last: from then on the loop copies
