@@ -23,7 +23,7 @@ from sim_server.backends.gpu.measured import TEXT as MEASURED_TEXT
 from sim_server.backends.gpu.momentum import MOMENTUM
 from sim_server.backends.gpu.newton import BLOCK_NODES, NEWTON, bodies_of, node_ranges
 from sim_server.backends.gpu.rosenbrock import DECISION
-from sim_server.backends.gpu.solver import threads_and_blocks
+from sim_server.backends.gpu.solver_layout import threads_and_blocks
 from sim_server.backends.gpu.structs import PCG
 from tests.support import nvrtc
 

@@ -41,6 +41,7 @@ from sim_server.backends.gpu.rosenbrock import ATTEMPTS, RosenbrockStep
 from sim_server.backends.gpu.shared_device_memory import SharedDeviceMemory
 from sim_server.backends.gpu.smoothing import FactorSmoothing
 from sim_server.backends.gpu.solver import PCG_BODY, SETTINGS_BYTES, PcgSolver
+from sim_server.backends.gpu.solver_features import SolverFeatures
 from sim_server.backends.gpu.splits import DeviceSplits, Staged
 from sim_server.backends.gpu.state import device_array, device_arrays
 from sim_server.backends.gpu.step_records import StepRecords
@@ -139,13 +140,13 @@ class GpuEngine(DeviceLoop):
             (given.contact.corner, given.contact.weight) if given.contact and surfaces else ()
         )
         self._prepared = False
-        self.solver = PcgSolver(
-            gpu, ranges, arrays, self._counter, CAPACITY, planes,
-            phases.of_solves(errors) if phases else (), ATTEMPTS if stages else 0,
-            given.contact is not None,
-            given.contact is not None and bool(given.contact.surfaces or given.contact.ties), correction, errors,
-            budgets, given.cut, self._smoothing, self._helper,
+        contact = given.contact
+        features = SolverFeatures(
+            planes, phases.of_solves(errors) if phases else (), ATTEMPTS if stages else 0, contact is not None,
+            contact is not None and bool(contact.surfaces or contact.ties), correction, errors, budgets, given.cut,
+            self._smoothing, self._helper,
         )  # fmt: skip
+        self.solver = PcgSolver(gpu, ranges, arrays, self._counter, CAPACITY, features)
         self._newton, newton_results = None, None
         if newton and phases:
             newton_results = device.pinned(CAPACITY * NEWTON_RESULT.itemsize * bodies)
