@@ -242,9 +242,9 @@ def test_an_error_that_no_check_foresees_costs_its_message_alone(
         raise IndexError("index 7 is out of bounds")
 
     if beside:
-        monkeypatch.setattr(factor_intake, "LARGE", 0)
+        monkeypatch.setattr(factor_intake, "LARGE_MESSAGE", 0)
     batch, refusals = stage.batch(), stage.driver.link.counters.refusals["unexpected"]
-    monkeypatch.setattr(FactorDecoder, "_copied", broken)
+    monkeypatch.setattr(FactorDecoder, "_taken", broken)
     stage.send(stage.answer(batch, [0, 2]))
     stage.driver.until(lambda: stage.failed() == {"a", "c"}, "the refusals")
     assert "was refused: factors of a and 1 more by worker hand: IndexError" in stage.driver.failures[0][1]
