@@ -239,7 +239,7 @@ class SlotPool:
             return None
         try:
             slot = Slot(capacity)
-        except SlotsUnusable:
+        except (SlotsUnusable, OSError):
             if not self._live:
                 raise
             return None
