@@ -122,9 +122,8 @@ class Dispatch(FactorSource):
 
     def epoch(self, name: str) -> int | None:
         """Returns the epoch of an object that was announced last; jobs of others are refused."""
-        with self._lock:
-            known = self.decoder.objects.get(name)
-            return None if known is None else known.epoch
+        known = self.decoder.objects.get(name)  # without the lock: it is asked of each factor
+        return None if known is None else known.epoch
 
     def workers(self) -> list[WorkerInfo]:
         """Returns the last heartbeats of the workers that may be given jobs."""

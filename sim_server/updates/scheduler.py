@@ -12,7 +12,7 @@ round_robin  the object whose matrix was sent longest ago
 Whatever the rule, an object whose last matrix is `overdue` goes first, so none starves.
 """
 
-from collections.abc import Callable
+import ctypes as c
 from dataclasses import dataclass, fields
 from math import ceil, inf
 from typing import Any
@@ -22,11 +22,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from sim_server.arrays import Float64, Int64
 from sim_server.scene.solver_options import Rule
+from sim_server.updates.update_table import COLUMNS, TEXT, address, library, requests_of
 
 Flags = NDArray[np.bool_]
 
-OUTLOOK = 10.0  # steps for which the excess of the last solve is taken to go on
-MAX_DOUBLINGS = 10  # of the least interval between matrices of an object whose jobs fail
+RULES: dict[Rule, int] = {"excess": TEXT.enumerators["BY_EXCESS"], "round_robin": TEXT.enumerators["BY_WAITING"]}
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,11 +67,6 @@ class UpdateRequests:
         return UpdateRequests(*(getattr(self, field.name)[chosen] for field in fields(self)))
 
 
-def expected_excess(requests: UpdateRequests) -> Float64:
-    """Returns the sums of bodies as they will be OUTLOOK steps from now if the excess of the last solve goes on."""
-    return requests.excess + OUTLOOK * requests.latest
-
-
 def is_worthwhile(requests: UpdateRequests, threshold: float = 1.0) -> Flags:
     """True where a new factor is worth its time now (the policy `adaptive`).
 
@@ -82,12 +77,6 @@ def is_worthwhile(requests: UpdateRequests, threshold: float = 1.0) -> Flags:
     """
     lost = requests.lost * requests.iteration_cost
     return (requests.age < 0) | requests.on_trial | (lost >= threshold * requests.factorization_cost)
-
-
-_PRIORITY: dict[Rule, Callable[[UpdateRequests], NDArray[Any]]] = {
-    "excess": expected_excess,
-    "round_robin": lambda requests: requests.waited,
-}
 
 
 def pick(
@@ -103,15 +92,18 @@ def pick(
     the rule; among equals the one that waited longest, then by order. A body in flight is left out, and one whose
     last matrix was sent less than min_interval steps ago (twice as long after each failure).
     """
-    new = requests.waited < 0
-    rested = new | (requests.waited >= min_interval << np.minimum(requests.failures, MAX_DOUBLINGS))
-    ready = requests.of(np.flatnonzero(rested & ~requests.in_flight))
-    new, late = ready.waited < 0, ready.waited >= overdue
-    group = np.where(new, 0, np.where(late, 1, 2))
-    first = np.where(new, ready.excess, np.where(late, ready.waited, _PRIORITY[rule](ready)))
-    order = np.lexsort((np.where(new, 0, -ready.waited), -first, group))  # the last key is the first to count
-    chosen: list[int] = ready.body[order[: max(places, 0)]].tolist()
-    return chosen
+    places = min(max(places, 0), len(requests))
+    if not places:
+        return []
+    columns: dict[str, NDArray[Any]] = {
+        name: np.ascontiguousarray(getattr(requests, name), kind) for kind, names in COLUMNS.items() for name in names
+    }  # fmt: skip
+    chosen, given = np.empty(places, np.int64), requests_of(columns)
+    count = library().wf_pick(
+        c.addressof(given), len(requests), places, min_interval, RULES[rule], overdue, address(chosen)
+    )  # fmt: skip
+    bodies: list[int] = chosen[:count].tolist()
+    return bodies
 
 
 def round_duration(latencies: ArrayLike, jobs: float) -> float:

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from protocol.messages_pb2 import RUNAWAY
 from sim_server.backends.kinds import Kind
 from sim_server.updates.autotune.convergence import Convergence, convergence
-from sim_server.updates.body_state import BodyUpdateState, observe_steps
+from sim_server.updates.body_state import BodyUpdateState
+from sim_server.updates.update_table import RAN_AWAY
 
 if TYPE_CHECKING:
     from sim_server.updates.driver import Driver
@@ -31,10 +32,10 @@ class SolveObserver:
         self._position = np.array([simulation.engine.settings(b.index).position for b in bodies])
         self._matrix_bytes = [BLOCK_BYTES * len(system.body_values(b.first, b.last)) for b in bodies]
 
-    def observe(self, records: NDArray[Any]) -> None:
-        """Sums up records of the loop, in their order."""
+    def observe(self, records: NDArray[Any], told: int) -> None:
+        """Sums up contiguous records of the loop, in their order. told: what they tell (update_table.told)"""
         states = self._driver.bodies
-        if self._driver.simulation.energies.freezes:
+        if told & RAN_AWAY and self._driver.simulation.energies.freezes:
             for body in set(records["body"][records["status"] == RUNAWAY].tolist()):
                 states[body].frozen = True
         whole_steps = len(records) >= max(len(states), MIN_TOGETHER) and len(records) % len(states) == 0
@@ -64,7 +65,7 @@ class SolveObserver:
     def _observe_steps(self, r: NDArray[Any]) -> None:
         """Sums up whole steps, (steps, bodies): where bodies are many, their factors wait for this function."""
         driver, states = self._driver, self._driver.bodies
-        observe_steps(driver.table, r, driver.solver.update_floor_iterations)
+        driver.table.observe(r, driver.solver.update_floor_iterations)
         if not self._tuned:
             return
         shortfall, used = convergence(r, driver.solver, self._position)

@@ -113,6 +113,26 @@ class Helper:
         with self._lock:
             self._free.append(row)
 
+    @staticmethod
+    def helped(nodes: Int64, own: NDArray[np.bool_], per_processor: int) -> NDArray[np.bool_]:
+        """Returns which bodies are helped, (bodies,). Raises InputError where none is.
+
+        nodes, own (bodies,): of each body, and whether it has thread blocks of its own
+        per_processor: thread blocks of a multiprocessor
+        """
+        found: NDArray[np.bool_] = (nodes >= LEAST_NODES) & own
+        if per_processor > 1:
+            raise InputError(
+                f"solver.gpus = 2 with {len(nodes)} objects, of which a multiprocessor takes several at a time: "
+                "allowed is 1"
+            )
+        if not found.any():
+            raise InputError(
+                f"solver.gpus = 2: the largest object has {nodes.max()} nodes; two GPUs are for objects of "
+                f"{LEAST_NODES} and more, allowed is 1"
+            )
+        return found
+
     def connect_solver(
         self, nodes: Int64, threads: int, shared: int, ranges: NDArray[Any], initial_range: NDArray[np.int32],
         types: dict[str, str],

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim_server.arrays import Int32
-from sim_server.backends.contact import Contact, Surfaces
+from sim_server.backends.contact import MOST_MODES, Contact, Surfaces
 from sim_server.backends.declarations import Declarations
 from sim_server.backends.gpu.cupy_types import DeviceArray, KernelFunction
 from sim_server.backends.gpu.device import Gpu, compiled, options, own_headers
@@ -33,7 +33,6 @@ WARM_START, ZERO_START, LAW_AT_START, LAW = ISLAND.enumeration("Evaluation").val
 KERNELS_OF_TIES = ("begin_ties", "bind_edges", "keep_ties")
 OWN_SURFACES = "-DOWN_SURFACES"  # in texts of scenes whose bodies touch themselves
 SWEEP_OF_FACES = ("sweep_island_faces",)
-MOST_MODES = 600  # of the coarse space of an island of bodies
 DETECTION = (
     "pair_boxes", "pair_trees", "pair_sites", "pair_edges", "pair_sweep", "edge_sweep", "end_sweep", "look_at_bodies",
     "list_island_rows", "find_islands", "place_entries", "fill_entries",

@@ -128,6 +128,7 @@ class DeviceLoop(Reports):
         self._own_memory: dict[int, Float64] = {}  # by its place
         entries = np.ctypeslib.as_array(self._readbacks)
         self._copied_steps, self._requests = entries["copied_step"], entries["requested"]
+        self._staged_at = entries["staged_begin"]
         loop.driver = c.addressof(device.functions)
         loop.context, loop.stream, loop.copy_stream = device.context, device.stream, device.copies
         loop.mail_slots, loop.mail_slot_count = c.addressof(self._slots), len(mailboxes)
@@ -273,12 +274,16 @@ class DeviceLoop(Reports):
         one behind it leaves alone; None: where matrices are large, or of another type."""
         if self._real != np.float64 or not self._doubled:
             return None
-        begin = self._staged_begin[body]
-        place = begin + self._room[body] if self._readbacks[body].staged_begin == begin else begin
-        if place not in self._own_memory:
+        place = self._other_place(body)
+        if (own := self._own_memory.get(place)) is None:
             memory = self._staging()[place : place + self._room[body]]
-            self._own_memory[place] = memory.view(np.float64).reshape(-1, 3, 3)
-        return self._own_memory[place]
+            own = self._own_memory[place] = memory.view(np.float64).reshape(-1, 3, 3)
+        return own
+
+    def _other_place(self, body: int) -> int:
+        """First byte of the place for a copy that the last one was not brought to: who has that may still read it."""
+        begin = self._staged_begin[body]
+        return begin + self._room[body] if self._staged_at[body] == begin else begin
 
     def prepare_copies(self) -> None:
         """Makes the memory of copies, which is page-locked: while it is made all calls to CUDA wait."""
@@ -296,9 +301,8 @@ class DeviceLoop(Reports):
         self._staging()
         if target is not self.copy_memory(body):
             self._targets[body] = target
-        entry, begin = self._readbacks[body], self._staged_begin[body]
-        if self._doubled:  # the other one: who has the copy before this one may still read it
-            entry.staged_begin = begin + self._room[body] if entry.staged_begin == begin else begin
+        if self._doubled:
+            self._staged_at[body] = self._other_place(body)
         self._copied_steps[body] = -1
         self._requests[body] = request  # last: from then on the loop copies
         self.loop.requested = 1
@@ -322,7 +326,7 @@ class DeviceLoop(Reports):
     def staged_matrix(self, body: int) -> int:
         """Returns the device address of the copy requested last, once it is complete: the same float64 values
         (blocks, 3, 3), until the next request. 0: there is none."""
-        entry = self._readbacks[body]
-        if not self.loop.staged or entry.copied_step < 0 or self._real != np.float64:
+        staged = self.loop.staged
+        if not staged or self._copied_steps[body] < 0 or self._real != np.float64:
             return 0
-        return int(self.loop.staged) + int(entry.staged_begin)
+        return int(staged) + int(self._staged_at[body])
