@@ -47,7 +47,7 @@ class Copies:
         self._library = library if hash_address() is not None else None
         if self._library is not None:
             i, p = c.c_int32, c.c_void_p
-            arguments: list[Any] = [c.c_int64, p, p, p, i, i, p, p, p, i]
+            arguments: list[Any] = [c.c_int64, p, p, p, i, i, p, p, p, p, p, p, i]
             self._library.copy_all.restype, self._library.copy_all.argtypes = None, arguments
 
     def copy(
@@ -64,29 +64,64 @@ class Copies:
             made = [copied(s, t.view(s.dtype), s if own_sources else t.view(s.dtype)) for s, t in pairs]
             return [each[0] for each in made], [each[1] for each in made]
         assert all(s.nbytes == t.nbytes for s, t in zip(sources, targets, strict=True))
-        return self._call(sources, _addresses(targets), own_sources)
+        return self._call(sources, _addresses(targets), own_sources)[:2]
+
+    def take(
+        self, sources: Sequence[NDArray[Any]], memory: NDArray[Any], diagonals: Sequence[NDArray[np.int64]]
+    ) -> tuple[list[int], list[bool], list[bool]]:  # fmt: skip
+        """Copies sources one behind the other into memory, of the same type and as many numbers. Returns of each copy
+        its `checksum` and `all_finite`, and whether the numbers on its diagonal are greater than 0.
+
+        sources: may be written to meanwhile; what is returned is about the copies
+        diagonals: places in each source of what are to be positive; those of one array are read once
+        """
+        sizes = [each.size for each in sources]
+        ends = np.cumsum(sizes, dtype=np.int64)
+        assert memory.dtype == sources[0].dtype and ends[-1] == memory.size and memory.flags.c_contiguous
+        if self._library is None:
+            targets = np.split(memory, ends[:-1])
+            sums, finite = self.copy(sources, targets)
+            own = zip(targets, diagonals, strict=True)
+            return sums, finite, [bool((target[places] > 0).all()) for target, places in own]
+        first = memory.__array_interface__["data"][0]
+        begin = np.array(first + (ends - sizes) * memory.itemsize, np.uintp)
+        return self._call(sources, begin, False, diagonals)
 
     def sum_up(self, arrays: Sequence[NDArray[Any]]) -> tuple[list[int], list[bool]]:
         """Returns `checksum` and `all_finite` of each array."""
         if self._library is None:
             return [checksum(each) for each in arrays], [all_finite(each) for each in arrays]
-        return self._call(arrays, None, True)
+        return self._call(arrays, None, True)[:2]
 
     def _call(
-        self, sources: Sequence[NDArray[Any]], targets: NDArray[np.uintp] | None, own_sources: bool
-    ) -> tuple[list[int], list[bool]]:  # fmt: skip
+        self, sources: Sequence[NDArray[Any]], targets: NDArray[np.uintp] | None, own_sources: bool,
+        diagonals: Sequence[NDArray[np.int64]] = (),
+    ) -> tuple[list[int], list[bool], list[bool]]:  # fmt: skip
         assert self._library is not None
         count, item = len(sources), sources[0].itemsize if sources else 4
         assert item in (4, 8) and all(each.itemsize == item and each.flags.c_contiguous for each in sources)
         size = np.array([each.nbytes for each in sources], np.int64)
-        begin = _addresses(sources)
-        sums, finite = np.empty(count, np.uint64), np.empty(count, np.bool_)
+        begin, places = _addresses(sources), _Places(diagonals) if diagonals else None
+        sums, finite, positive = np.empty(count, np.uint64), np.empty(count, np.bool_), np.ones(count, np.bool_)
         threads = 1 + min(helping_threads(), count - 1) if int(size.sum()) > ALONE else 1
         self._library.copy_all(
             count, begin.ctypes.data, None if targets is None else targets.ctypes.data, size.ctypes.data, item,
-            own_sources, hash_address(), sums.ctypes.data, finite.ctypes.data, threads,
+            own_sources, hash_address(), sums.ctypes.data, finite.ctypes.data,
+            places and places.begin.ctypes.data, places and places.count.ctypes.data, positive.ctypes.data, threads,
         )  # fmt: skip
-        return sums.tolist(), finite.tolist()
+        return sums.tolist(), finite.tolist(), positive.tolist()
+
+
+class _Places:
+    """Places in arrays, as native code reads them. begin: address of the first in each array. count: of each"""
+
+    def __init__(self, each: Sequence[NDArray[np.int64]]):
+        known = {id(places): places for places in each}
+        self._kept = list(known.values())
+        assert all(places.dtype == np.int64 and places.flags.c_contiguous for places in self._kept)
+        address = {key: places.ctypes.data for key, places in known.items()}
+        self.begin = np.array([address[id(places)] for places in each], np.uintp)
+        self.count = np.array([len(places) for places in each], np.int64)
 
 
 def _addresses(arrays: Sequence[NDArray[Any]]) -> NDArray[np.uintp]:

@@ -22,6 +22,7 @@ from sim_server.network.leases import InFlightJob
 T = TypeVar("T")
 
 LARGE = 4 << 20  # bytes of a factor whose copy and checks take more than a few milliseconds
+LARGE_MESSAGE = 1 << 19  # bytes of the factors of a message, for which it takes a tenth of one: it comes often
 FETCHES = 2  # factors that arrive in parts at a time, each in memory of its own
 Results = list[Factor | Refused]
 """Of decoding the factors of a message: each, or why it is refused."""
@@ -71,6 +72,7 @@ class FactorIntake:
         self._session, self._server, self._incarnation = session, server, incarnation
         self._pool, self._counters, self._book = pool, counters, book
         self._thread = ThreadPoolExecutor(1, "large factors")
+        self._messages = ThreadPoolExecutor(1, "factors of messages")  # small ones, which wait for no large one
         self._fetching = ThreadPoolExecutor(FETCHES, "parts of factors")
         self.factors: list[Factor] = []
         self._decoding: dict[int, Decoding] = {}  # beside the caller, by number of the job
@@ -139,9 +141,9 @@ class FactorIntake:
         seconds = [message.seconds[place] for place, _ in good]
         together = DecodedTogether([job for _, job in good], seconds, message.matrix_shared, duration)
         decode = partial(self._all_decoded, message, good)
-        if 4 * sum(message.nonzeros) <= LARGE:
+        if 4 * sum(message.nonzeros) <= LARGE_MESSAGE:
             return self._take_together(together, decode())
-        self._together.append((together, self._woken(self._thread.submit(decode))))
+        self._together.append((together, self._woken(self._messages.submit(decode))))
         self._beside.update(job.number for job in together.jobs)
 
     def _matched(self, message: FactorBatch) -> dict[int, tuple[int, InFlightJob]]:

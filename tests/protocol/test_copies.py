@@ -60,6 +60,27 @@ def test_what_others_write_to_the_targets_changes_no_checksum(made):
     assert [each.tobytes() for each in bytes_of_targets] == [each.tobytes() for each in sources]
 
 
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_they_are_taken_in_one_behind_the_other_and_what_is_not_positive_is_found(made, dtype):
+    sources = [np.abs(each) + 1 for each in arrays(dtype, SIZES[1:])]
+    shared = np.array([0, 2, 40, 59])  # of those of 60 and of 61 numbers
+    places = [np.array([0]), np.array([], np.int64), shared, shared, np.array([4095]), np.array([0, 70_000])]
+    sources[0][0], sources[1][:], sources[2][41] = 0, -1, -1  # only the first is looked at
+    sources[3][59], sources[4][17], sources[5][-1] = -0.0, np.inf, np.nan
+    memory = np.full(sum(map(len, sources)), np.nan, dtype)
+    sums, finite, positive = made.take(sources, memory, places)
+    assert memory.tobytes() == b"".join(each.tobytes() for each in sources)
+    assert sums == [checksum(each) for each in sources]
+    assert finite == [True] * 4 + [False] * 2
+    assert positive == [False, True, True, False, True, False]
+
+
+def test_memory_of_another_size_or_type_is_a_mistake_of_the_caller(made):
+    for memory in (np.zeros(5), np.zeros(3), np.zeros(4, np.float32), np.zeros(8)[::2]):
+        with pytest.raises((AssertionError, ValueError)):
+            made.take([np.zeros(4)], memory, [np.array([0])])
+
+
 def test_many_large_arrays_are_shared_by_threads(made, monkeypatch):
     monkeypatch.setattr(module, "helping_threads", lambda: 3)
     sources = arrays(np.float64, [ALONE // 8 // 6] * 9)

@@ -242,9 +242,9 @@ def test_an_error_that_no_check_foresees_costs_its_message_alone(
         raise IndexError("index 7 is out of bounds")
 
     if beside:
-        monkeypatch.setattr(factor_intake, "LARGE", 0)
+        monkeypatch.setattr(factor_intake, "LARGE_MESSAGE", 0)
     batch, refusals = stage.batch(), stage.driver.link.counters.refusals["unexpected"]
-    monkeypatch.setattr(FactorDecoder, "_copied", broken)
+    monkeypatch.setattr(FactorDecoder, "_taken", broken)
     stage.send(stage.answer(batch, [0, 2]))
     stage.driver.until(lambda: stage.failed() == {"a", "c"}, "the refusals")
     assert "was refused: factors of a and 1 more by worker hand: IndexError" in stage.driver.failures[0][1]
@@ -309,7 +309,7 @@ def test_answers_of_no_job_and_second_answers_are_refused_one_by_one(stage: Hand
 
 def test_large_batches_are_decoded_beside_the_caller(stage: Hand, monkeypatch: pytest.MonkeyPatch) -> None:
     """All count as large here. Meanwhile nothing is taken and second answers are refused; then each counts alone."""
-    monkeypatch.setattr(factor_intake, "LARGE", 0)
+    monkeypatch.setattr(factor_intake, "LARGE_MESSAGE", 0)
     batch, go = stage.batch(), threading.Event()
     decode, before = stage.driver.link.dispatch.decoder.decode_several, stage.driver.link.counters.refusals["duplicate"]
 

@@ -489,6 +489,7 @@ class FactorUpload:
         """Fills in what is made at some places, each in a storage, a new one unless there is one to spare."""
         storages: dict[int, InverseStorage] = {}  # by place
         made_new = iter(self._new_storages(planned.builder, sum(chosen[place].spare is None for place in places)))
+        reserved = False
         for place in places:
             try:
                 storage = chosen[place].spare
@@ -496,11 +497,12 @@ class FactorUpload:
                     storage = next(made_new, None)
                 if storage is None:
                     storage = planned.builder.storage()
-                self._solver.reserve_vectors(chosen[place].body, planned.plan)
+                reserved |= self._solver.reserve_vectors(chosen[place].body, planned.plan)
                 storages[place] = storage
             except Exception as error:
                 made[place] = error
-        self._gpu.cp.cuda.get_current_stream().synchronize()  # new arrays are complete for other streams
+        if reserved:
+            self._gpu.cp.cuda.get_current_stream().synchronize()  # new vectors are complete for other streams
         builder, able, multiprocessors = planned.builder, list(storages), self._multiprocessors
         for k in range(0, len(able), builder.most):
             some = able[k : k + builder.most]
@@ -513,8 +515,8 @@ class FactorUpload:
                 self._apply(builder, inverse, chosen[place])
 
     def _new_storages(self, builder: InverseBuilder, count: int) -> list[InverseStorage]:
-        """Makes storages for several inverses at once; none where they are few, or there is too little memory."""
-        if count < MANY:
+        """Makes storages for several inverses at once; none for one, or where there is too little memory."""
+        if count < 2:
             return []
         try:
             return builder.several_storages(count)

@@ -88,6 +88,7 @@ class PcgSolver:
         self._helped, self._helper = np.zeros(len(ranges), bool), features.helper
         if self._helper:
             self._helped = self._connected(self._helper)
+        self._blocks_of: list[int] = (self.bodies["blocks"] * np.where(self._helped, 2, 1)).tolist()  # of all GPUs
         self.params = self._arguments(len(arrays["row_start"]) - 1)
         self._device = gpu.cp.cuda.Device()
         self._planner = ThreadPoolExecutor(1, "plans of inverses")
@@ -280,12 +281,13 @@ class PcgSolver:
         made in a thread. Its result raises what `plan` raises. planes: float16 numbers per entry; None: those of
         usual factors"""
         planes = planes or self.planes or 1
-        blocks = int(self.bodies[body]["blocks"]) * (2 if self._helped[body] else 1)
-        key = (pattern.id, planes, blocks)
+        key = pattern.id, planes, self._blocks_of[body]
+        if (known := self._plans.get(key)) is not None:  # as nearly always, without the lock
+            return known
         with self._lock:
             if key in self._plans:
                 return self._plans[key]
-            made = self._plans[key] = self.beside(lambda: self._planned(pattern, blocks, planes))
+            made = self._plans[key] = self.beside(lambda: self._planned(pattern, key[2], planes))
         made.add_done_callback(partial(self._forget_failed, key))
         return made
 
@@ -326,16 +328,19 @@ class PcgSolver:
         """
         return self.begin_plan(body, pattern, planes).result().plan
 
-    def reserve_vectors(self, body: int, plan: DevicePlan) -> None:
-        """Allocates the vectors of solves of a body with factors of this plan, unless they are there. From any thread;
-        the caller has them complete before a step reads them."""
+    def reserve_vectors(self, body: int, plan: DevicePlan) -> bool:
+        """Allocates the vectors of solves of a body with factors of this plan, unless they are there; returns whether
+        it did. From any thread; the caller has them complete before a step reads them."""
+        key = body, plan.address
+        if key in self._vectors or key in self._far_vectors:  # as nearly always, without the lock
+            return False
         with self._lock:
-            key = body, plan.address
             if self._helper and self._helped[body]:
                 if key not in self._far_vectors:
                     self._far_vectors[key] = self._helper.vectors(plan)
             elif key not in self._vectors:
                 self._vectors[key] = plan.vectors()
+        return True
 
     def use(self, body: int, pattern: FactorPattern, inverse: PartitionedInverse, planes: int, step: int) -> None:
         """Writes a factor into the host row of a body; it is in use once the row is uploaded."""

@@ -43,7 +43,8 @@ def largest_responses(pattern: FactorPattern, values: Sequence[NDArray[np.floati
     Takes a few passes over L. From any thread, without Python's lock.
     """
     numbers = [np.ascontiguousarray(each, np.float32) for each in values]
-    each, found = np.array([one.ctypes.data for one in numbers], np.uintp), np.empty(len(numbers))
+    each = np.array([one.__array_interface__["data"][0] for one in numbers], np.uintp)
+    found = np.empty(len(numbers))
     arrays = pattern.super_start, pattern.row_start, pattern.rows, pattern.value_start, each, found
     threads = 1 + min(helping_threads(), len(numbers) // FEW)
     library().largest_responses(
@@ -58,6 +59,7 @@ def planes_of(factors: Sequence[tuple[FactorPattern, NDArray[np.floating]]]) -> 
     planes = [1] * len(factors)
     for pattern in dict.fromkeys(pattern for pattern, _ in factors):
         places = [place for place, (own, _) in enumerate(factors) if own is pattern]
-        for place, response in zip(places, largest_responses(pattern, [factors[k][1] for k in places]), strict=True):
-            planes[place] = 1 if response <= MOST_RESPONSE else 2
+        good = largest_responses(pattern, [factors[k][1] for k in places]) <= MOST_RESPONSE
+        for k in np.flatnonzero(~good).tolist():
+            planes[places[k]] = 2
     return planes
