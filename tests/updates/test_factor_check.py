@@ -117,7 +117,8 @@ def several(sim: Simulation, matrix: NDArray) -> list[tuple[Factor, NDArray | No
     bad = [changed(factor, how) for how in BAD for factor in good[:3]]
     cut = dataclasses.replace(good[0], values=good[0].values[:-1])
     found: list[tuple[Factor, NDArray | None]] = []
-    for k, factor in enumerate([good[0]] * 6 + good + bad[:13] + [cut] + bad[13:] + good):
+    mixed = [good[0], bad[0], good[0], bad[9], bad[12]]  # of one pattern, which are applied together
+    for k, factor in enumerate([*mixed, cut] + [good[1]] * 5 + good + bad[:13] + [good[0]] * 6 + bad[13:] + mixed):
         found.append((factor, None if k % 5 == 3 else matrix))
     return found
 
@@ -258,13 +259,13 @@ def test_the_copy_of_a_matrix_is_kept_until_its_factor_came(monkeypatch):
     places: set[int] = set()
     reject_reasons = driver.check.reject_reasons
 
-    def looked(checked: Sequence[tuple[Factor, NDArray | None]]) -> list[str]:
+    def looked(checked: Sequence[tuple[Factor, NDArray | None]], applied: None) -> list[str]:
         for factor, matrix in checked:
             values = matrix if matrix is not None else np.zeros(1)
             fresh = made_of(driver, values) if matrix is not None else None
             places.add(values.ctypes.data)
             seen.append((factor.step, fresh is not None and np.array_equal(fresh, factor.values)))
-        return reject_reasons(checked)
+        return reject_reasons(checked, applied)
 
     monkeypatch.setattr(driver.check, "reject_reasons", looked)
     driver.advance(20)
