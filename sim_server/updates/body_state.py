@@ -67,7 +67,7 @@ class SolveStatistics:
 class JobState:
     """The matrix that is being copied or factorized.
 
-    copy: into which the loop copies the matrix or the positions requested
+    copy: into which the loop copies the matrix or the positions requested (`set_copy`)
     request: number of the request for that copy, among those of all bodies; requested: when it was [s, monotonic]
     extrapolated: by how much the positions requested were extrapolated [s]
     sent: step of the last matrix that was sent; None: none was
@@ -81,22 +81,18 @@ class JobState:
 
     def __init__(self, table: UpdateTable, index: int):
         self._table, self._index = table, index
-        self._copy: NDArray[np.float64] | None = None
+        self.copy: NDArray[np.float64] | None = None
         self.request, self.requested, self.extrapolated = 0, 0.0, 0.0
         self.matrix: tuple[int, NDArray[np.float64]] | None = None
         self.positions = False
 
-    @property
-    def copy(self) -> NDArray[np.float64] | None:
-        return self._copy
-
-    @copy.setter
-    def copy(self, copy: NDArray[np.float64] | None) -> None:
-        self._copy, self._table.copying[self._index] = copy, copy is not None
+    def set_copy(self, copy: NDArray[np.float64] | None) -> None:
+        """Takes note of the memory that the loop is asked to copy into; None: the copy is given up."""
+        self.copy, self._table.copying[self._index] = copy, copy is not None
 
     def on_sent(self, step: int) -> None:
         """Takes note that the copy was sent, but for what stands in the table."""
-        copy, self._copy = self._copy, None
+        copy, self.copy = self.copy, None
         self.matrix = None if copy is None else (step, copy)
         self.positions = copy is not None and copy.ndim == 2
 

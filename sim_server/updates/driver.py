@@ -29,10 +29,9 @@ from sim_server.updates.factor_check import FactorCheck
 from sim_server.updates.factor_source import FactorSource, Inline, Job
 from sim_server.updates.patterns import Patterns
 from sim_server.updates.policies import make_policy
-from sim_server.updates.scheduler import UpdateRequests
 from sim_server.updates.snapshots import SnapshotPool
 from sim_server.updates.solve_observer import SolveObserver
-from sim_server.updates.update_table import NONE, UpdateTable, told
+from sim_server.updates.update_table import NONE, UpdateRequests, UpdateTable
 from sim_server.updates.useless_factors import UselessFactors
 
 log = logging.getLogger(__name__)
@@ -154,9 +153,7 @@ class Driver:
     def observe(self, records: NDArray[Any]) -> None:
         """Sums up what solves cost, lets `auto` choose, drops useless factors."""
         records = np.ascontiguousarray(records)
-        tells = told(records)
-        self._observer.observe(records, tells)
-        self.useless_factors.observe(records, tells)
+        self.useless_factors.observe(records, self._observer.observe(records))
 
     # --- matrices out -------------------------------------------------------------------------------------------
 
@@ -170,7 +167,7 @@ class Driver:
         tuners = [state.tuner for state in self.bodies] if self._tuned else []
         on_trial = [t is not None and t.wants_factor for t in tuners]
         compared = [t is not None and t.factorization.candidate is not None for t in tuners]
-        return UpdateRequests(**self.table.requests(self.engine.step, ahead, on_trial, compared))
+        return self.table.requests(self.engine.step, ahead, on_trial, compared)
 
     def make_job(self, state: BodyUpdateState, step: int | None = None) -> Job | None:
         """Returns the job of the copy that the loop has made for a body. None: the copy does not suffice and is

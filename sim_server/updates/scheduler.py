@@ -13,58 +13,16 @@ Whatever the rule, an object whose last matrix is `overdue` goes first, so none 
 """
 
 import ctypes as c
-from dataclasses import dataclass, fields
 from math import ceil, inf
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sim_server.arrays import Float64, Int64
 from sim_server.scene.solver_options import Rule
-from sim_server.updates.update_table import COLUMNS, TEXT, address, library, requests_of
-
-Flags = NDArray[np.bool_]
+from sim_server.updates.update_table import COLUMNS, TEXT, Flags, UpdateRequests, address, addresses, library
 
 RULES: dict[Rule, int] = {"excess": TEXT.enumerators["BY_EXCESS"], "round_robin": TEXT.enumerators["BY_WAITING"]}
-
-
-@dataclass(frozen=True, eq=False)
-class UpdateRequests:
-    """What the scheduler knows of some bodies: arrays with an entry for each.
-
-    body: its number
-    excess: summed iterations above the floor
-    waited: steps since its last matrix was sent; -1: none was yet
-    in_flight: a matrix of it is being copied or factorized
-    age: steps since the matrix of its factor; -1: it has no factor
-    iteration_cost, factorization_cost: in any unit, as long as it is the same for all bodies
-    failures: jobs in a row that brought no factor
-    lost: summed iterations above the floor of solves with the factor in use
-    on_trial: a new factor is wanted for a comparison, whatever was lost
-    latest: excess of the last solve
-    """
-
-    body: Int64
-    excess: Float64
-    waited: Int64
-    in_flight: Flags
-    age: Int64
-    iteration_cost: Float64
-    factorization_cost: Float64
-    failures: Int64
-    lost: Float64
-    on_trial: Flags
-    latest: Float64
-
-    def __len__(self) -> int:
-        return len(self.body)
-
-    def of(self, chosen: Any) -> "UpdateRequests":
-        """Returns the requests that an index or a mask chooses."""
-        if isinstance(chosen, np.ndarray) and chosen.dtype == np.bool_ and chosen.all():
-            return self
-        return UpdateRequests(*(getattr(self, field.name)[chosen] for field in fields(self)))
 
 
 def is_worthwhile(requests: UpdateRequests, threshold: float = 1.0) -> Flags:
@@ -95,12 +53,16 @@ def pick(
     places = min(max(places, 0), len(requests))
     if not places:
         return []
-    columns: dict[str, NDArray[Any]] = {
-        name: np.ascontiguousarray(getattr(requests, name), kind) for kind, names in COLUMNS.items() for name in names
-    }  # fmt: skip
-    chosen, given = np.empty(places, np.int64), requests_of(columns)
+    if (native := requests.native) is None:
+        columns: dict[str, NDArray[Any]] = {
+            name: np.ascontiguousarray(getattr(requests, name), kind)
+            for kind, names in COLUMNS.items()
+            for name in names
+        }
+        native = addresses(columns)
+    chosen = np.empty(places, np.int64)
     count = library().wf_pick(
-        c.addressof(given), len(requests), places, min_interval, RULES[rule], overdue, address(chosen)
+        c.addressof(native), len(requests), places, min_interval, RULES[rule], overdue, address(chosen)
     )  # fmt: skip
     bodies: list[int] = chosen[:count].tolist()
     return bodies

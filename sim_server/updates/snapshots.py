@@ -43,16 +43,17 @@ class SnapshotPool:
         self._requested.pop(body.index, None)  # to stand behind all others
         self._requested[body.index] = state
         if self._workers_assemble(state):
-            job.copy = self._allocate((body.last - body.first, 3))
+            copy = self._allocate((body.last - body.first, 3))
             job.extrapolated = self._extrapolated_time(state)
-            engine.request_positions(body.index, job.copy, job.extrapolated)
+            engine.request_positions(body.index, copy, job.extrapolated)
         else:
             job.extrapolated = 0.0
             if (shape := self._shapes.get(body.index)) is None:
                 shape = self._shapes[body.index] = (self._simulation.system.most_blocks(body.first, body.last), 3, 3)
             own = engine.copy_memory(body.index)
-            job.copy = own if own is not None and own.shape == shape else self._allocate(shape)
-            engine.request_matrix(body.index, job.copy)
+            copy = own if own is not None and own.shape == shape else self._allocate(shape)
+            engine.request_matrix(body.index, copy)
+        job.set_copy(copy)
 
     def step(self, state: BodyUpdateState) -> int:
         """Returns the steps completed before the one whose matrix was copied; -1: the copy is not there yet."""
@@ -81,7 +82,7 @@ class SnapshotPool:
         """Gives up a copy that is not sent."""
         assert state.job.copy is not None
         self.recycle(state.job.copy)
-        state.job.copy = None
+        state.job.set_copy(None)
 
     def release(self, state: BodyUpdateState, step: int = -1) -> NDArray[np.float64] | None:
         """Recycles the copy of the job in flight, which is over. Returns it if it is the matrix of `step`: to be read

@@ -58,6 +58,8 @@ static double excess(const Record& r, int floor, double error_bound) {
     return std::max(r.iterations - floor * stages * std::max(r.linearizations, 1), 0);
 }
 
+static int32_t told_by(const Record& r) { return (r.status == RUNAWAY ? RAN_AWAY : 0) | (r.fallbacks > 0 ? ABANDONED : 0); }
+
 // A rank: bodies without a matrix yet, then overdue ones, then by the rule; among equals the one that waited longest, then by order.
 struct Ranked {
     int group;
@@ -79,13 +81,14 @@ extern "C" {
 // What records tell: of Told.
 int32_t wf_told(const Record* r, int64_t count) {
     int32_t told = 0;
-    for (int64_t k = 0; k < count; ++k) told |= (r[k].status == RUNAWAY ? RAN_AWAY : 0) | (r[k].fallbacks > 0 ? ABANDONED : 0);
+    for (int64_t k = 0; k < count; ++k) told |= told_by(r[k]);
     return told;
 }
 
-// Takes note of whole steps, records (steps, bodies), as BodyUpdateState.observe does of each, in seconds.
-void wf_observe(const Table* t, const Record* records, int64_t steps, int32_t floor) {
+// Takes note of whole steps, records (steps, bodies), as BodyUpdateState.observe does of each, in seconds. Returns what they tell.
+int32_t wf_observe(const Table* t, const Record* records, int64_t steps, int32_t floor) {
     std::vector<double> above(steps);
+    int32_t told = 0;
     for (int64_t b = 0; b < t->bodies; ++b) {
         const Record* first = records + b;
         const int64_t made = first->factor_step, newest = t->newest[b];
@@ -93,6 +96,7 @@ void wf_observe(const Table* t, const Record* records, int64_t steps, int32_t fl
         double sum = 0;
         for (int64_t k = 0; k < steps; ++k) {
             const Record& r = first[k * t->bodies];
+            told |= told_by(r);
             sum += above[k] = excess(r, floor, t->error_bound[b]);
             one = one && r.factor_step == made;
             add(t->iteration_cost[b], r.solve / (r.iterations + 1));
@@ -118,6 +122,7 @@ void wf_observe(const Table* t, const Record* records, int64_t steps, int32_t fl
             t->latest[b] = above[k];
         }
     }
+    return told;
 }
 
 // Counts bodies whose copy is requested or waits to be sent, those with a job at a worker or a factor that is checked, and those with

@@ -4,7 +4,8 @@ thousand bodies in a few calls of native code (update_table.cpp). body_state.py 
 """
 
 import ctypes as c
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, fields
 from functools import cache
 from typing import Any
 
@@ -34,7 +35,53 @@ class Table(c.Structure):
 
 @TEXT.struct
 class Requests(c.Structure):
-    """Addresses of the columns of UpdateRequests (scheduler.py)."""
+    """Addresses of the columns of UpdateRequests."""
+
+
+Flags = NDArray[np.bool_]
+
+
+@dataclass(eq=False)
+class UpdateRequests:
+    """What the scheduler knows of some bodies: arrays with an entry for each, which do not change.
+
+    body: its number
+    excess: summed iterations above the floor
+    waited: steps since its last matrix was sent; -1: none was yet
+    in_flight: a matrix of it is being copied or factorized
+    age: steps since the matrix of its factor; -1: it has no factor
+    iteration_cost, factorization_cost: in any unit, as long as it is the same for all bodies
+    failures: jobs in a row that brought no factor
+    lost: summed iterations above the floor of solves with the factor in use
+    on_trial: a new factor is wanted for a comparison, whatever was lost
+    latest: excess of the last solve
+    native: addresses of these arrays; None: not known yet
+    """
+
+    body: Int64
+    excess: Float64
+    waited: Int64
+    in_flight: Flags
+    age: Int64
+    iteration_cost: Float64
+    factorization_cost: Float64
+    failures: Int64
+    lost: Float64
+    on_trial: Flags
+    latest: Float64
+    native: Requests | None = field(default=None, init=False)
+
+    def __len__(self) -> int:
+        return len(self.body)
+
+    def of(self, chosen: Any) -> "UpdateRequests":
+        """Returns the requests that an index or a mask chooses."""
+        return UpdateRequests(*(getattr(self, each.name)[chosen] for each in fields(self) if each.init))
+
+
+def addresses(columns: Mapping[str, NDArray[Any]]) -> Requests:
+    """Returns the addresses of columns, contiguous and of the types of COLUMNS, which must be kept."""
+    return Requests(**{name: address(column) for name, column in columns.items()})
 
 
 @cache
@@ -43,7 +90,7 @@ def library() -> Any:
     Raises CompileError."""
     i, n, p = c.c_int32, c.c_int64, c.c_void_p
     signatures: dict[str, tuple[Any, list[Any]]] = {
-        "wf_told": (i, [p, n]), "wf_observe": (None, [p, p, n, i]), "wf_count": (None, [p, p]),
+        "wf_told": (i, [p, n]), "wf_observe": (i, [p, p, n, i]), "wf_count": (None, [p, p]),
         "wf_requests": (n, [p, n, i, p, p, p]), "wf_pick": (n, [p, n, n, n, i, c.c_double, p]),
     }  # fmt: skip
     compiled = native(SOURCE, signatures, stepping=False, lock=True)
@@ -95,16 +142,21 @@ class UpdateTable:
             setattr(self._columns, member.name, address(getattr(self, member.name)))
         self._native = c.addressof(self._columns)
         self._counts = np.zeros(3, np.int64)
+        self._asked: dict[str, NDArray[Any]] = {}
+        for kind, names in COLUMNS.items():
+            self._asked |= zip(names, np.empty((len(names), bodies), kind), strict=True)
+        self._requests = addresses(self._asked)
 
     def __len__(self) -> int:
         return len(self.excess)
 
-    def observe(self, records: NDArray[Any], floor: int) -> None:
+    def observe(self, records: NDArray[Any], floor: int) -> int:
         """Takes note of contiguous records (steps, bodies), as BodyUpdateState.observe does of each, in seconds.
+        Returns what they tell (`told`).
 
         floor: iterations of a linear solve above which they are excess
         """
-        library().wf_observe(self._native, address(records), len(records), floor)
+        return int(library().wf_observe(self._native, address(records), len(records), floor))
 
     def counts(self) -> tuple[int, int, int]:
         """Returns how many bodies have a copy that is requested or waits to be sent, how many a job at a worker or a
@@ -115,24 +167,18 @@ class UpdateTable:
 
     def requests(
         self, step: int, ahead: bool, on_trial: Sequence[bool], compared: Sequence[bool]
-    ) -> dict[str, NDArray[Any]]:  # fmt: skip
-        """Returns the columns of UpdateRequests at a step (Driver.requests).
+    ) -> UpdateRequests:  # fmt: skip
+        """Returns what the scheduler is told of bodies at a step (Driver.requests), until this is asked again.
 
         ahead: only of bodies whose next matrix may go ahead of the check of their last factor
         on_trial, compared: of each body, what `auto` wants; empty: nothing
         """
-        columns: dict[str, NDArray[Any]] = {}
-        for kind, names in COLUMNS.items():
-            columns |= zip(names, np.empty((len(names), len(self)), kind), strict=True)
         wanted = [np.array(each, np.bool_) if each else None for each in (on_trial, compared)]
-        given, out = [None if each is None else address(each) for each in wanted], requests_of(columns)
-        count = int(library().wf_requests(self._native, step, ahead, *given, c.addressof(out)))
-        return columns if count == len(self) else {name: column[:count] for name, column in columns.items()}
-
-
-def requests_of(columns: dict[str, NDArray[Any]]) -> Requests:
-    """Returns the addresses of some columns, contiguous and of the types of UpdateTable.requests."""
-    return Requests(**{name: address(column) for name, column in columns.items()})
+        given = [None if each is None else address(each) for each in wanted]
+        count = int(library().wf_requests(self._native, step, ahead, *given, c.addressof(self._requests)))
+        made = UpdateRequests(**{name: column[:count] for name, column in self._asked.items()})
+        made.native = self._requests
+        return made
 
 
 class Cell:

@@ -259,13 +259,13 @@ def test_the_copy_of_a_matrix_is_kept_until_its_factor_came(monkeypatch):
     places: set[int] = set()
     reject_reasons = driver.check.reject_reasons
 
-    def looked(checked: Sequence[tuple[Factor, NDArray | None]], applied: None) -> list[str]:
+    def looked(checked: Sequence[tuple[Factor, NDArray | None]], *applied: None) -> list[str]:
         for factor, matrix in checked:
             values = matrix if matrix is not None else np.zeros(1)
             fresh = made_of(driver, values) if matrix is not None else None
             places.add(values.ctypes.data)
             seen.append((factor.step, fresh is not None and np.array_equal(fresh, factor.values)))
-        return reject_reasons(checked, applied)
+        return reject_reasons(checked, *applied)
 
     monkeypatch.setattr(driver.check, "reject_reasons", looked)
     driver.advance(20)

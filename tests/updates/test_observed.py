@@ -15,6 +15,7 @@ from sim_server.recording import messages
 from sim_server.service.telemetry import Telemetry
 from sim_server.updates.body_state import on_factors
 from sim_server.updates.driver import Driver
+from sim_server.updates.scheduler import pick
 from sim_server.updates.solve_observer import MIN_TOGETHER
 from sim_server.updates.update_table import ABANDONED, NONE, RAN_AWAY, UpdateTable, told
 from tests.scenes import bar, simulation
@@ -160,9 +161,10 @@ def test_requests_say_what_the_table_holds(ahead):
         "factorization_cost": np.nan_to_num(table.cost, nan=1.0),
     }  # fmt: skip
     found = table.requests(step, ahead, on_trial, compared)
-    assert {name: column.tolist() for name, column in found.items()} == {
+    assert {name: getattr(found, name).tolist() for name in expected} == {
         name: column[wanted].tolist() for name, column in expected.items()
     }
+    assert pick(found, 9) == pick(found.of(np.arange(len(found))), 9)
     flying = table.in_flight | checked
     assert table.counts() == (table.copying.sum(), flying.sum(), (table.failures > 0).sum())
 

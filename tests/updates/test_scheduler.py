@@ -45,7 +45,7 @@ class Row:
 
 def together(rows: list[Row]) -> UpdateRequests:
     """As arrays; an object's number is its place."""
-    columns = ([getattr(r, f.name) for r in rows] for f in dataclasses.fields(UpdateRequests)[1:])
+    columns = ([getattr(r, f.name) for r in rows] for f in dataclasses.fields(UpdateRequests)[1:-1])
     kinds = (float, int, bool, int, float, float, int, float, bool, float)
     arrays = (
         np.array([-1 if value is None else value for value in column], kind)
