@@ -17,11 +17,11 @@ ALLOWED = {  # what each folder imports of its package
     "protocol.materials": set(),
     "protocol.process": set(),
     "protocol.shared_memory": {"channels", "refused", "validate"},
-    "precond_worker.symbolic": {"arrays", "compiled"},
+    "precond_worker.symbolic": {"arrays"},
     "precond_worker.gpu": {"arrays", "errors", "many", "symbolic"},
     "precond_worker.factorization": {"arrays", "errors", "gpu", "many", "symbolic"},
     "precond_worker.jobs": {"arrays", "errors", "factorization", "many", "network", "remote_assembly", "symbolic"},
-    "precond_worker.network": {"compiled", "errors", "remote_assembly"},
+    "precond_worker.network": {"errors", "remote_assembly"},
     "clients.commands": {
         "accuracy",
         "client",

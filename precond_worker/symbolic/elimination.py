@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from precond_worker.arrays import Int32, Int64
-from precond_worker.compiled import compiled
 from precond_worker.symbolic.blocks import inverse_permutation, rows_of
+from precond_worker.symbolic.compiled import compiled
 
 SOURCE = Path(__file__).with_suffix(".cpp")
 

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from precond_worker.arrays import Float64, Int64
-from precond_worker.compiled import compiled
 from precond_worker.symbolic.blocks import BLOCK, pivot_threshold
+from precond_worker.symbolic.compiled import compiled
 from protocol.factor import FactorPattern
 
 SOURCE = Path(__file__).with_suffix(".cpp")
