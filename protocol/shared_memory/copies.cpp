@@ -41,7 +41,8 @@ bool all_positive(const char* data, const int64_t* places, int64_t count) {
 extern "C" {
 
 // Copies sources[i] to targets[i], of bytes[i] each; of the copies, or of what is summed up in place without targets, sums[i] is
-// the hash, and finite[i] whether all numbers of `item` bytes, 4 or 8, are finite. own_sources: that is said of the sources.
+// the hash, and finite[i] whether all numbers of `item` bytes, 4 or 8, are finite (null: not looked at). own_sources: that is
+// said of the sources.
 // places: null, or of each the numbers, place_count[i] of them, of which positive[i] tells whether all are greater than 0.
 // threads: that share the work, this one among them, if there are so many.
 void copy_all(int64_t count, const char* const* sources, char* const* targets, const int64_t* bytes, int32_t item,
@@ -55,9 +56,9 @@ void copy_all(int64_t count, const char* const* sources, char* const* targets, c
             for (int64_t at = 0; at < bytes[i]; at += PIECE) {
                 const int64_t size = std::min(PIECE, bytes[i] - at);
                 if (targets) std::memcpy(targets[i] + at, sources[i] + at, size_t(size));
-                good &= all_finite(own + at, size, item);
+                if (finite) good &= all_finite(own + at, size, item);
             }
-            finite[i] = good;
+            if (finite) finite[i] = good;
             sums[i] = hash(own, size_t(bytes[i]));
             if (places)
                 positive[i] = item == 8 ? all_positive<double>(own, places[i], place_count[i])

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from functools import cache
 from importlib import import_module
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import xxhash
@@ -35,6 +35,28 @@ def hash_address() -> int | None:
         if address and HASH(address)(sample, len(sample)) == xxhash.xxh3_64_intdigest(sample):
             return address
     return None
+
+
+class Parts(NamedTuple):
+    """Parts of an array, by columns. array: contiguous; begin (k,): first byte of each part"""
+
+    array: NDArray[Any]
+    begin: NDArray[np.int64]
+
+    def addresses(self, size: NDArray[np.int64]) -> NDArray[np.uintp]:
+        """Returns the addresses of the parts, of `size` bytes each (k,). Raises ValueError unless all lie inside."""
+        assert self.array.flags.c_contiguous and self.begin.shape == size.shape
+        most = self.array.nbytes
+        inside = (size >= 0) & (size <= most) & (self.begin >= 0) & (self.begin <= most - size)  # no sum may overflow
+        if not inside.all():
+            raise ValueError(f"parts of an array lie outside of its {most} bytes")
+        return (self.array.__array_interface__["data"][0] + self.begin).astype(np.uintp)
+
+    def split(self, size: NDArray[np.int64]) -> list[NDArray[np.uint8]]:
+        """Returns the bytes of each part. Raises as `addresses`."""
+        self.addresses(size)
+        flat = self.array.reshape(-1).view(np.uint8)
+        return [flat[a:b] for a, b in zip(self.begin.tolist(), (self.begin + size).tolist(), strict=True)]
 
 
 class Copies:
@@ -64,7 +86,8 @@ class Copies:
             made = [copied(s, t.view(s.dtype), s if own_sources else t.view(s.dtype)) for s, t in pairs]
             return [each[0] for each in made], [each[1] for each in made]
         assert all(s.nbytes == t.nbytes for s, t in zip(sources, targets, strict=True))
-        return self._call(sources, _addresses(targets), own_sources)[:2]
+        size, item = _sizes(sources)
+        return self._call(_addresses(sources), _addresses(targets), size, item, own_sources)[:2]
 
     def take(
         self, sources: Sequence[NDArray[Any]], memory: NDArray[Any], diagonals: Sequence[NDArray[np.int64]]
@@ -85,31 +108,59 @@ class Copies:
             return sums, finite, [bool((target[places] > 0).all()) for target, places in own]
         first = memory.__array_interface__["data"][0]
         begin = np.array(first + (ends - sizes) * memory.itemsize, np.uintp)
-        return self._call(sources, begin, False, diagonals)
+        size, item = _sizes(sources)
+        return self._call(_addresses(sources), begin, size, item, False, diagonals)
 
     def sum_up(self, arrays: Sequence[NDArray[Any]]) -> tuple[list[int], list[bool]]:
         """Returns `checksum` and `all_finite` of each array."""
         if self._library is None:
             return [checksum(each) for each in arrays], [all_finite(each) for each in arrays]
-        return self._call(arrays, None, True)[:2]
+        size, item = _sizes(arrays)
+        return self._call(_addresses(arrays), None, size, item, True)[:2]
+
+    def copy_parts(
+        self, source: Parts, target: Parts, size: NDArray[np.int64], own_sources: bool = False
+    ) -> list[int]:  # fmt: skip
+        """Copies parts of an array to parts of another one, of `size` bytes each (k,); returns the `checksum` of each.
+        Raises ValueError if a part lies outside of its array.
+
+        own_sources: as of `copy`
+        """
+        begin, to = source.addresses(size), target.addresses(size)
+        if self._library is None:
+            pairs = zip(source.split(size), target.split(size), strict=True)
+            return [copied(s, t, s if own_sources else t)[0] for s, t in pairs]
+        return self._call(begin, to, size, 0, own_sources)[0]
+
+    def sum_parts(self, source: Parts, size: NDArray[np.int64]) -> list[int]:
+        """Returns the `checksum` of parts of an array, of `size` bytes each (k,). Raises as `copy_parts`."""
+        if self._library is None:
+            return [checksum(each) for each in source.split(size)]
+        return self._call(source.addresses(size), None, size, 0, True)[0]
 
     def _call(
-        self, sources: Sequence[NDArray[Any]], targets: NDArray[np.uintp] | None, own_sources: bool,
-        diagonals: Sequence[NDArray[np.int64]] = (),
+        self, begin: NDArray[np.uintp], targets: NDArray[np.uintp] | None, size: NDArray[np.int64], item: int,
+        own_sources: bool, diagonals: Sequence[NDArray[np.int64]] = (),
     ) -> tuple[list[int], list[bool], list[bool]]:  # fmt: skip
-        assert self._library is not None
-        count, item = len(sources), sources[0].itemsize if sources else 4
-        assert item in (4, 8) and all(each.itemsize == item and each.flags.c_contiguous for each in sources)
-        size = np.array([each.nbytes for each in sources], np.int64)
-        begin, places = _addresses(sources), _Places(diagonals) if diagonals else None
-        sums, finite, positive = np.empty(count, np.uint64), np.empty(count, np.bool_), np.ones(count, np.bool_)
+        """item: bytes of a number; 0: whether all are finite is not looked at, and there are no diagonals."""
+        assert self._library is not None and (item or not diagonals)
+        count, size = len(begin), np.ascontiguousarray(size, np.int64)
+        places = _Places(diagonals) if diagonals else None
+        sums, finite, positive = np.empty(count, np.uint64), np.ones(count, np.bool_), np.ones(count, np.bool_)
         threads = 1 + min(helping_threads(), count - 1) if int(size.sum()) > ALONE else 1
         self._library.copy_all(
             count, begin.ctypes.data, None if targets is None else targets.ctypes.data, size.ctypes.data, item,
-            own_sources, hash_address(), sums.ctypes.data, finite.ctypes.data,
+            own_sources, hash_address(), sums.ctypes.data, finite.ctypes.data if item else None,
             places and places.begin.ctypes.data, places and places.count.ctypes.data, positive.ctypes.data, threads,
         )  # fmt: skip
         return sums.tolist(), finite.tolist(), positive.tolist()
+
+
+def _sizes(arrays: Sequence[NDArray[Any]]) -> tuple[NDArray[np.int64], int]:
+    """Returns the bytes of each array of one type, each contiguous, and of one of their numbers."""
+    item = arrays[0].itemsize if arrays else 4
+    assert item in (4, 8) and all(each.itemsize == item and each.flags.c_contiguous for each in arrays)
+    return np.array([each.nbytes for each in arrays], np.int64), item
 
 
 class _Places:

@@ -26,7 +26,7 @@ Reals = NDArray[np.float64]
 MAX_RESIDUAL = 0.05  # |r - A P^-1 r| / |r| of a factor that is to take the place of A; exact ones in float32 have 1e-3
 WITH_FACTOR, WITH_BLOCK_JACOBI = 1, 2  # parts of a judgement (factor_check.cpp)
 NO_VALUES = np.zeros(1, np.float32)
-WORK = 8  # numbers for each degree of freedom
+WORK = 9  # numbers for each degree of freedom
 MIN_SHARE = 0.9  # of what block Jacobi takes off, for a factor to be used; not 1, as one vector is not the space
 
 

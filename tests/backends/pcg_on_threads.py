@@ -22,6 +22,7 @@ from sim_server.backends.gpu import solver as gpu_solver
 from sim_server.backends.gpu import solver_layout
 from sim_server.backends.gpu.contact import ContactPasses
 from sim_server.backends.gpu.correction import CORRECTED_BODY, FactorCorrection
+from sim_server.backends.gpu.host_results import ContactResults
 from sim_server.backends.gpu.row_partition import assign_blocks
 from sim_server.backends.gpu.solver import PCG_RESULT, PcgSolver
 from sim_server.backends.gpu.solver_features import SolverFeatures
@@ -299,7 +300,7 @@ class ContactSolver(Solver):
         self.told, self.reactions = np.zeros((4, 1), CONTACT_RESULT), np.zeros((4, 1, obstacles, 6))
         self.passes = ContactPasses(
             self.gpu, device, given.contact, given.ranges, given.arrays, self.solver, as_device(np.zeros(1, BALANCE)),
-            self.told, self.reactions, np.zeros(0, np.int32), self.correction,
+            ContactResults(self.told, self.reactions, np.zeros(0, np.int32), None), self.correction,
         )  # fmt: skip
         self.solver.params["b"] = self.passes.memory["contact_b"].data.ptr
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from sim_server.backends.gpu.faces import DEFINED
-from sim_server.backends.gpu.islands import ISLAND, TALLY, tree_heights
+from sim_server.backends.gpu.island_memory import ISLAND, TALLY, tree_heights
 from sim_server.backends.gpu.structs import PAIR_SUM
 from sim_server.backends.kinds import KINDS
 from sim_server.simulation import Simulation

@@ -269,6 +269,6 @@ def test_a_factor_is_kept_until_its_object_has_another_or_nobody_asks(offered: O
     clock.now = 1.1 * offered_factors.KEPT
     offered.expire()
     assert offered.kept == 1 and ask(offered, 0, 3)
-    offered.withdraw("beam")
-    offered.withdraw("beam")
+    offered.withdraw(["beam"])
+    offered.withdraw(["beam"])
     assert offered.kept == 0

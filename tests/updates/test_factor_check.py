@@ -117,7 +117,8 @@ def several(sim: Simulation, matrix: NDArray) -> list[tuple[Factor, NDArray | No
     bad = [changed(factor, how) for how in BAD for factor in good[:3]]
     cut = dataclasses.replace(good[0], values=good[0].values[:-1])
     found: list[tuple[Factor, NDArray | None]] = []
-    for k, factor in enumerate([good[0]] * 6 + good + bad[:13] + [cut] + bad[13:] + good):
+    mixed = [good[0], bad[0], good[0], bad[9], bad[12]]  # of one pattern, which are applied together
+    for k, factor in enumerate([*mixed, cut] + [good[1]] * 5 + good + bad[:13] + [good[0]] * 6 + bad[13:] + mixed):
         found.append((factor, None if k % 5 == 3 else matrix))
     return found
 

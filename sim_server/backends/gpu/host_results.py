@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 
 from sim_server.arrays import Float64, Int32
 from sim_server.backends.base import EngineInput
-from sim_server.backends.gpu.islands import PairsTold
 from sim_server.backends.gpu.loop import CAPACITY, LoopDevice
 from sim_server.backends.gpu.structs import (
     CONTACT_RESULT,
@@ -22,6 +21,8 @@ from sim_server.backends.gpu.structs import (
 
 MOST_TOLD = 16  # other bodies whose forces on a body are told, at most
 Bytes = NDArray[np.uint8]
+PairsTold = tuple[NDArray[Any], NDArray[Any]]
+"""What bodies exert on each other: (capacity, bodies, most) of PAIR_SUM; (capacity, bodies) how many each has."""
 
 
 @dataclass(frozen=True)
@@ -34,7 +35,7 @@ class ContactResults:
     pairs: of bodies that touch each other; None: they do not
     """
 
-    solves: Bytes
+    solves: NDArray[Any]
     reactions: Float64
     broken: Int32
     pairs: PairsTold | None

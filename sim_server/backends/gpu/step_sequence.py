@@ -162,7 +162,7 @@ class StepSequence:
         assert given.contact is not None and results is not None
         passes = ContactPasses(
             self._gpu, self._device, given.contact, given.ranges, given.arrays, self.solver, self.energies.balance,
-            results.solves, results.reactions, results.broken, self._correction, results.pairs,
+            results, self._correction,
         )  # fmt: skip
         if passes.detects:
             self._assembly = self._whole_assembly = [*self._whole_assembly, passes.detect]
