@@ -20,6 +20,7 @@ from protocol.located import address
 from protocol.validate import ALONE, all_finite, checksum, copied, helping_threads
 
 SOURCE = Path(__file__).with_name("copies.cpp")
+SHARED = ALONE // 2  # bytes from where on threads share the work: a millisecond, of which they take a tenth to start
 HASH = c.CFUNCTYPE(c.c_uint64, c.c_char_p, c.c_size_t)
 NAMES = ("XXH3_64bits_dispatch", "XXH3_64bits")  # the first one chooses the best instructions of the processor
 
@@ -147,7 +148,7 @@ class Copies:
         count, size = len(begin), np.ascontiguousarray(size, np.int64)
         places = _Places(diagonals) if diagonals else None
         sums, finite, positive = np.empty(count, np.uint64), np.ones(count, np.bool_), np.ones(count, np.bool_)
-        threads = 1 + min(helping_threads(), count - 1) if int(size.sum()) > ALONE else 1
+        threads = 1 + min(helping_threads(), count - 1) if int(size.sum()) > SHARED else 1
         self._library.copy_all(
             count, begin.ctypes.data, None if targets is None else targets.ctypes.data, size.ctypes.data, item,
             own_sources, hash_address(), sums.ctypes.data, finite.ctypes.data if item else None,

@@ -35,9 +35,12 @@ from sim_server.arrays import Float32, Float64
 from sim_server.backends.shared_memory import SharedMemory
 from sim_server.network.leases import InFlightJob
 from sim_server.network.native_copies import native_copies
+from sim_server.scene.size_limits import expected_values
 from sim_server.updates.factor_source import FactorMemory
 
 LARGE = 1 << 20  # bytes of a factor for which `memory` is asked
+WORST_FILL = 6  # over that of nested dissection; minimum degree orderings leave about twice as much
+ALWAYS_ALLOWED = 1 << 18  # values, a megabyte: a small matrix may well have a dense factor
 MAX_PATTERNS = 4  # kept per object: one for each library among its workers
 
 
@@ -78,6 +81,11 @@ class AnnouncedObject:
     def pattern(self, id: int) -> FactorPattern | None:
         """Returns a pattern that a worker has sent for this object, or that a factor of one like it had."""
         return self.patterns.get(id) or self.complete.patterns.get(id)
+
+    @property
+    def most_allowed(self) -> int:
+        """Most values of a pattern: slots for factors of this object and those like it have room for the largest."""
+        return max(ALWAYS_ALLOWED, int(WORST_FILL * expected_values(self.size // 3, self.blocks)))
 
     @property
     def known_patterns(self) -> list[int]:
@@ -145,6 +153,12 @@ class FactorDecoder:
         pattern = FactorPattern.from_message(message)
         if pattern.id in known.patterns:
             return None
+        if pattern.nonzeros > (most := known.most_allowed):
+            raise Refused(
+                f"FactorPattern.nonzeros is {pattern.nonzeros}; allowed for the {known.blocks} blocks of the matrix: "
+                f"at most {most}, {WORST_FILL} times what nested dissection leaves",
+                "size",
+            )
         while len(known.patterns) >= MAX_PATTERNS:
             known.patterns.pop(next(iter(known.patterns)))
         known.patterns[pattern.id] = pattern

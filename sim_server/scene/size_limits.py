@@ -25,7 +25,7 @@ Copies = Callable[[Sequence[float]], float]
 
 BASE = 126e6  # bytes of the process
 TET = 2e3  # bytes of an element: arrays of mesh, matrix, kernels and frames
-FACTOR = 4 * 72.0  # bytes of L in single precision over nodes^(4/3)
+VALUES = 72.0  # numbers of L over nodes^(4/3)
 HELD = 3  # copies of L in memory of the server's own: in use, the next one, and one that arrives
 LENT = 3  # the same in slots of shared memory, as far as these may be lent
 BLOCKS = {"linear": 15, "patch": 31, "smoothed": 46, "quadratic": 29}  # of A over nodes of a bar, by kind of element
@@ -89,10 +89,16 @@ def estimate(sizes: Sequence[Size], factors: bool, copies: Copies | None = None)
     needed = BASE + TET * sum(size.tets for size in sizes)
     if not factors:
         return needed
-    each = [FACTOR * size.nodes ** (4 / 3) for size in sizes]
+    each = [4 * VALUES * size.nodes ** (4 / 3) for size in sizes]
     lent = sum(size for size in each if size <= POOL_LIMIT / SLOT_SHARE)  # larger ones travel in parts
     copied = 0.0 if copies is None else copies([size.blocks for size in sizes])
     return needed + HELD * sum(each) + min(LENT * lent, POOL_LIMIT) + copied
+
+
+def expected_values(nodes: int, blocks: int) -> float:
+    """Returns how many values L of a matrix with so many 3x3 blocks has at most by nested dissection: the law above for
+    linear elements, in proportion to the blocks of a node for others (tests/link/test_inflated_patterns.py)."""
+    return float(VALUES * nodes ** (1 / 3) * blocks / BLOCKS["linear"])
 
 
 def _size(o: SceneObject, integrator: IntegratorOptions) -> Size:

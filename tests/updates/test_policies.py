@@ -500,15 +500,15 @@ def test_a_check_that_fails_by_itself_refuses_the_factor_and_the_run_goes_on(sen
     driver, factor, _ = sent
     if not beside:
         monkeypatch.setattr(driver_module, "LARGE", 1 << 40)
-    check = driver.check.probe_all
+    check = driver.check._judged
     monkeypatch.setattr(driver.check, "reject_reasons", FactorCheck.reject_reasons.__get__(driver.check))
-    monkeypatch.setattr(driver.check, "probe_all", lambda *_: {}["nose"])
+    monkeypatch.setattr(driver.check, "_judged", lambda *_: {}["nose"])
     driver.adopt([factor])
     wait([each.reasons for each in driver.checks])
     assert driver.advance(2)["factor_step"].tolist() == [-1, -1]
     assert driver.bodies[0].failures.refused == 1 and not driver.checks
     assert driver.bodies[0].failures.reported == {"that of w is not used: its check failed: KeyError: 'nose'"}
-    monkeypatch.setattr(driver.check, "probe_all", check)
+    monkeypatch.setattr(driver.check, "_judged", check)
     driver.adopt([replace(factor, step=driver.engine.step)])
     wait([each.reasons for each in driver.checks])
     driver.advance(1)
