@@ -16,6 +16,7 @@ import numpy as np
 import xxhash
 from numpy.typing import NDArray
 
+from protocol.located import address
 from protocol.validate import ALONE, all_finite, checksum, copied, helping_threads
 
 SOURCE = Path(__file__).with_name("copies.cpp")
@@ -107,8 +108,7 @@ class Copies:
             sums, finite = self.copy(sources, targets)
             own = zip(targets, diagonals, strict=True)
             return sums, finite, [bool((target[places] > 0).all()) for target, places in own]
-        first = memory.__array_interface__["data"][0]
-        begin = np.array(first + (ends - sizes) * memory.itemsize, np.uintp)
+        begin = np.array(address(memory) + (ends - sizes) * memory.itemsize, np.uintp)
         size, item = _sizes(sources)
         return self._call(_addresses(sources), begin, size, item, False, diagonals)
 
@@ -171,10 +171,10 @@ class _Places:
         known = {id(places): places for places in each}
         self._kept = list(known.values())
         assert all(places.dtype == np.int64 and places.flags.c_contiguous for places in self._kept)
-        address = {key: places.ctypes.data for key, places in known.items()}
-        self.begin = np.array([address[id(places)] for places in each], np.uintp)
+        begin = {key: address(places) for key, places in known.items()}
+        self.begin = np.array([begin[id(places)] for places in each], np.uintp)
         self.count = np.array([len(places) for places in each], np.int64)
 
 
 def _addresses(arrays: Sequence[NDArray[Any]]) -> NDArray[np.uintp]:
-    return np.array([each.__array_interface__["data"][0] for each in arrays], np.uintp)
+    return np.array([address(each) for each in arrays], np.uintp)
