@@ -12,7 +12,7 @@ from protocol.method import Method
 from sim_server.backends.rosenbrock import FORMS
 from sim_server.mechanics.world import Body
 from sim_server.updates.autotune.preconditioner import PreconditionerTuner
-from sim_server.updates.stats import RunningMean, flops, updated
+from sim_server.updates.stats import RunningMean, flops
 from sim_server.updates.update_table import NONE, TEXT, Cell, MeanCell, UpdateTable
 
 MAX_REMEMBERED = 32  # factors whose method and worker are remembered
@@ -324,34 +324,15 @@ def on_factors(
 
     table: that of the states. step: during which they came
     """
-    row = np.array([state.body.index for state in states])
-    made = np.array([factor.step for factor in factors])
-    checked = made == table.checked[row]
-    came = checked | (table.in_flight[row] & (made == table.sent[row]))
-    _add(table.latency, row[came], np.maximum(1, step - made[came]))
-    table.checked[row[checked]] = NONE
-    table.in_flight[row] &= table.sent[row] > made
-    table.failures[row] = 0
-    newer = made > table.newest[row]
-    taken = row[newer]
-    _add(table.cost, taken, np.maximum([factor.seconds for factor in factors], MIN_SECONDS)[newer])
-    table.newest[taken] = made[newer]
-    table.used[taken] += 1
-    table.lost[taken] = 0.0
-    table.excess[taken] = table.latest[taken] = np.nan_to_num(table.first_excess[taken])
-    table.sent[taken] = np.where(table.sent[taken] == NONE, made[newer], table.sent[taken])
-    for state, factor, better in zip(states, factors, newer.tolist(), strict=True):
+    seconds = [max(factor.seconds, MIN_SECONDS) for factor in factors]
+    bodies, made = ([state._index for state in states], [factor.step for factor in factors])
+    newer = table.on_factors(np.array(bodies, np.int64), np.array(made, np.int64), np.array(seconds, np.float64), step)
+    for state, factor, cost, better in zip(states, factors, seconds, newer, strict=True):
         if state.job.positions:
             state.failures.assemblies = 0
         if better:
-            state.factors.note(factor, max(factor.seconds, MIN_SECONDS))
-    return list(newer.tolist())
-
-
-def _add(means: NDArray[np.float64], rows: NDArray[np.int64], values: NDArray[Any]) -> None:
-    """Adds a value to each of some running means, NaN where there was none."""
-    before = means[rows]
-    means[rows] = np.where(np.isnan(before), values, updated(before, values))
+            state.factors.note(factor, cost)
+    return newer
 
 
 def _remember(table: dict[int, Any], step: int, value: Any) -> None:

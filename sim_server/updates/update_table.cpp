@@ -26,11 +26,11 @@ constexpr int NO_STEP = -1;
 
 // Columns of the table, of an entry for each body.
 struct Table {
-    double *excess, *latest, *lost, *iteration_cost, *cost, *first_excess;
+    double *excess, *latest, *lost, *iteration_cost, *cost, *first_excess, *latency;
     const double* error_bound;
-    int64_t *factor_step, *max_factor_age, *refused;
-    const int64_t *newest, *sent, *checked, *failures;
-    const bool *dropped, *in_flight, *copying, *frozen;
+    int64_t *factor_step, *max_factor_age, *refused, *newest, *sent, *checked, *failures, *used;
+    bool* in_flight;
+    const bool *dropped, *copying, *frozen;
     int64_t bodies;
 };
 
@@ -123,6 +123,28 @@ int32_t wf_observe(const Table* t, const Record* records, int64_t steps, int32_t
         }
     }
     return told;
+}
+
+// Takes note of factors of different bodies, as BodyUpdateState.on_factor does of each, with costs in seconds.
+// body, made, seconds: of each its body, the step of its matrix, and what its making cost. step: during which they came. newer: of each,
+// whether it is newer than that of its body
+void wf_factors(const Table* t, const int64_t* body, const int64_t* made, const double* seconds, int64_t count, int64_t step, bool* newer) {
+    for (int64_t k = 0; k < count; ++k) {
+        const int64_t b = body[k];
+        const bool checked = made[k] == t->checked[b];
+        if (checked || (t->in_flight[b] && made[k] == t->sent[b])) add(t->latency[b], std::max<int64_t>(1, step - made[k]));
+        if (checked) t->checked[b] = NO_STEP;
+        t->in_flight[b] = t->in_flight[b] && t->sent[b] > made[k];
+        t->failures[b] = 0;
+        newer[k] = made[k] > t->newest[b];
+        if (!newer[k]) continue;
+        add(t->cost[b], seconds[k]);
+        t->newest[b] = made[k];
+        ++t->used[b];
+        t->lost[b] = 0;
+        t->excess[b] = t->latest[b] = std::isnan(t->first_excess[b]) ? 0 : t->first_excess[b];
+        if (t->sent[b] == NO_STEP) t->sent[b] = made[k]; // made elsewhere
+    }
 }
 
 // Counts bodies whose copy is requested or waits to be sent, those with a job at a worker or a factor that is checked, and those with

@@ -91,7 +91,8 @@ def library() -> Any:
     i, n, p = c.c_int32, c.c_int64, c.c_void_p
     signatures: dict[str, tuple[Any, list[Any]]] = {
         "wf_told": (i, [p, n]), "wf_observe": (i, [p, p, n, i]), "wf_count": (None, [p, p]),
-        "wf_requests": (n, [p, n, i, p, p, p]), "wf_pick": (n, [p, n, n, n, i, c.c_double, p]),
+        "wf_requests": (n, [p, n, i, p, p, p]), "wf_factors": (None, [p, p, p, p, n, n, p]),
+        "wf_pick": (n, [p, n, n, n, i, c.c_double, p]),
     }  # fmt: skip
     compiled = native(SOURCE, signatures, stepping=False, lock=True)
     TEXT.check_sizes(compiled)
@@ -157,6 +158,16 @@ class UpdateTable:
         floor: iterations of a linear solve above which they are excess
         """
         return int(library().wf_observe(self._native, address(records), len(records), floor))
+
+    def on_factors(self, bodies: Int64, made: Int64, seconds: Float64, step: int) -> list[bool]:
+        """Takes note of factors of different bodies that came during a step, as BodyUpdateState.on_factor does of each,
+        with costs in seconds. Returns of each whether it is newer than that of its body.
+
+        made: step of the matrix of each. seconds: cost of its making
+        """
+        newer, given = np.empty(len(bodies), np.bool_), [address(each) for each in (bodies, made, seconds)]
+        library().wf_factors(self._native, *given, len(bodies), step, address(newer))
+        return list(newer.tolist())
 
     def counts(self) -> tuple[int, int, int]:
         """Returns how many bodies have a copy that is requested or waits to be sent, how many a job at a worker or a

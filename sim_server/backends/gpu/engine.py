@@ -24,6 +24,7 @@ from sim_server.backends.gpu.cuda import CudaDevice
 from sim_server.backends.gpu.cupy_types import Graph
 from sim_server.backends.gpu.device import DeviceLaunch, Gpu
 from sim_server.backends.gpu.factor_upload import FactorUpload
+from sim_server.backends.gpu.helper import alone
 from sim_server.backends.gpu.host_results import HostResults
 from sim_server.backends.gpu.known_patterns import KnownPatterns
 from sim_server.backends.gpu.loop import CAPACITY, DeviceLoop
@@ -139,7 +140,8 @@ class GpuEngine(DeviceLoop):
     def run(self, steps: int) -> int:
         self._factor_upload.advance()
         self._make_ready()
-        return super().run(steps)
+        with alone(self.solver.features.helper):
+            return super().run(steps)
 
     def _make_ready(self) -> None:
         """Runs the launches before the first step, and takes the initial state of the energy balance."""
@@ -223,12 +225,14 @@ class GpuEngine(DeviceLoop):
         """Runs the second half: solve, integration, records."""
         self._factor_upload.settle()
         self.renew_mail()
-        if self._graphs.second_half:  # with branches, which only graphs have
-            self._graphs.second_half.launch(self._steps)
-        else:
-            with self._steps:
-                self.sequence.finish()
-        self.close_step()
+        graph = self._graphs.second_half
+        with alone(self.solver.features.helper):
+            if graph:  # with branches, which only graphs have
+                graph.launch(self._steps)
+            else:
+                with self._steps:
+                    self.sequence.finish()
+            self.close_step()
 
     # --- mailboxes ----------------------------------------------------------------------------------------------
 
