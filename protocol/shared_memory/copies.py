@@ -16,9 +16,11 @@ import numpy as np
 import xxhash
 from numpy.typing import NDArray
 
+from protocol.located import address
 from protocol.validate import ALONE, all_finite, checksum, copied, helping_threads
 
 SOURCE = Path(__file__).with_name("copies.cpp")
+SHARED = ALONE // 2  # bytes from where on threads share the work: a millisecond, of which they take a tenth to start
 HASH = c.CFUNCTYPE(c.c_uint64, c.c_char_p, c.c_size_t)
 NAMES = ("XXH3_64bits_dispatch", "XXH3_64bits")  # the first one chooses the best instructions of the processor
 
@@ -106,8 +108,7 @@ class Copies:
             sums, finite = self.copy(sources, targets)
             own = zip(targets, diagonals, strict=True)
             return sums, finite, [bool((target[places] > 0).all()) for target, places in own]
-        first = memory.__array_interface__["data"][0]
-        begin = np.array(first + (ends - sizes) * memory.itemsize, np.uintp)
+        begin = np.array(address(memory) + (ends - sizes) * memory.itemsize, np.uintp)
         size, item = _sizes(sources)
         return self._call(_addresses(sources), begin, size, item, False, diagonals)
 
@@ -147,7 +148,7 @@ class Copies:
         count, size = len(begin), np.ascontiguousarray(size, np.int64)
         places = _Places(diagonals) if diagonals else None
         sums, finite, positive = np.empty(count, np.uint64), np.ones(count, np.bool_), np.ones(count, np.bool_)
-        threads = 1 + min(helping_threads(), count - 1) if int(size.sum()) > ALONE else 1
+        threads = 1 + min(helping_threads(), count - 1) if int(size.sum()) > SHARED else 1
         self._library.copy_all(
             count, begin.ctypes.data, None if targets is None else targets.ctypes.data, size.ctypes.data, item,
             own_sources, hash_address(), sums.ctypes.data, finite.ctypes.data if item else None,
@@ -170,10 +171,10 @@ class _Places:
         known = {id(places): places for places in each}
         self._kept = list(known.values())
         assert all(places.dtype == np.int64 and places.flags.c_contiguous for places in self._kept)
-        address = {key: places.ctypes.data for key, places in known.items()}
-        self.begin = np.array([address[id(places)] for places in each], np.uintp)
+        begin = {key: address(places) for key, places in known.items()}
+        self.begin = np.array([begin[id(places)] for places in each], np.uintp)
         self.count = np.array([len(places) for places in each], np.int64)
 
 
 def _addresses(arrays: Sequence[NDArray[Any]]) -> NDArray[np.uintp]:
-    return np.array([each.__array_interface__["data"][0] for each in arrays], np.uintp)
+    return np.array([address(each) for each in arrays], np.uintp)

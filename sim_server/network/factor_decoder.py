@@ -11,6 +11,7 @@ import numpy as np
 
 from protocol.channels import CHANNELS, MOST_JOBS, name_in
 from protocol.factor import Factor, FactorPattern, check_values
+from protocol.located import rows
 from protocol.messages_pb2 import DeviceSlot as DeviceSlotMessage
 from protocol.messages_pb2 import Factor as FactorMessage
 from protocol.messages_pb2 import FactorBatch, Topology
@@ -285,9 +286,7 @@ class FactorDecoder:
         memory = memory[:total]
         sources = [_slot(job).part(job.first, dtype, count) for (job, _), count in zip(found, counts, strict=True)]
         looked = native_copies().take(sources, memory, [pattern.diagonal for _, pattern in found])
-        alike = counts.count(counts[0]) == len(counts)
-        values = list(memory.reshape(len(counts), -1)) if alike else np.split(memory, np.cumsum(counts)[:-1])
-        return values, *looked
+        return rows(memory, counts), *looked
 
     def _factor(
         self, known: AnnouncedObject, pattern: FactorPattern, values: Float32 | Float64, checksum: int | None,

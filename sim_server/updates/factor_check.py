@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from protocol.factor import Factor, FactorPattern
+from protocol.located import Located, address
 from sim_server.arrays import Int32
 from sim_server.backends.compiler import native
 from sim_server.backends.cpu import structs
@@ -190,18 +191,18 @@ class FactorCheck:
     ) -> None:  # fmt: skip
         bodies, count = [self._body(factor) for factor, _ in checked], len(checked)
         read = bool(parts & WITH_FACTOR) and applied is None  # those on a device would be copied
-        values = [np.ascontiguousarray(factor.values if read else NO_VALUES) for factor, _ in checked]
+        values = [_contiguous(factor.values) if read else NO_VALUES for factor, _ in checked]
         row_start, columns, r, patterns = np.array([body.addresses for body in bodies], np.uintp).T.copy()
         factors = np.zeros(count, FACTOR)
-        factors["pattern"], factors["values"] = patterns, [_address(each) for each in values]
+        factors["pattern"], factors["values"] = patterns, [address(each) for each in values]
         factors["step"], factors["bytes"] = [f.step for f, _ in checked], [each.itemsize for each in values]
         nodes = np.array([body.nodes for body in bodies], np.int32)
         if (needed := WORK * 3 * int(nodes.max())) > len(self._work):
             self._work = np.empty(needed)
-        matrices = np.array([0 if matrix is None else _address(matrix) for _, matrix in checked], np.uintp)
-        z = np.full(count, 0 if applied is None else _address(applied), np.uintp)
+        matrices = np.array([0 if matrix is None else address(matrix) for _, matrix in checked], np.uintp)
+        z = np.full(count, 0 if applied is None else address(applied), np.uintp)
         arrays = factors, nodes, row_start, columns, matrices, r, z, self._work, out
-        _library().wf_judge_all(count, parts, *map(_address, arrays))
+        _library().wf_judge_all(count, parts, *map(address, arrays))
 
     def _body(self, factor: Factor) -> CheckedBody:
         row_start, columns = self._patterns.at(factor.object, factor.epoch)
@@ -217,6 +218,5 @@ class FactorCheck:
         return self._vectors[size]
 
 
-def _address(array: NDArray[Any]) -> int:
-    address: int = array.__array_interface__["data"][0]
-    return address
+def _contiguous(values: NDArray[Any]) -> NDArray[Any]:
+    return values if isinstance(values, Located) and values.flags.c_contiguous else np.ascontiguousarray(values)

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: MIT
 """A slot of shared memory as a server lends it, without a network."""
 
+import fcntl
 import secrets
 from typing import Self
 
@@ -16,7 +17,10 @@ class LentSlot:
 
     def __init__(self, size: int, generation: int = 1):
         self.path = SHM / f"{secrets.randbelow(10**18)}.zenoh"
-        self._memory = np.memmap(self.path, np.uint8, "w+", shape=(size + HEADER,))
+        self._file = (made := self.path.with_suffix(".made")).open("w+b")
+        self._memory = np.memmap(self._file, np.uint8, "w+", shape=(size + HEADER,))
+        fcntl.flock(self._file, fcntl.LOCK_SH)  # processes with zenoh remove segments that nobody holds so
+        made.rename(self.path)
         self.data = self._memory[HEADER:]
         self.message = Slot(segment=self.path.name, offset=HEADER, capacity=size, generation=generation)
         self.lend(generation)
@@ -29,4 +33,5 @@ class LentSlot:
         return self
 
     def __exit__(self, *error: object) -> None:
-        self.path.unlink(missing_ok=True)  # a process with zenoh removes segments that nobody seems to hold
+        self.path.unlink()
+        self._file.close()

@@ -10,6 +10,7 @@ from precond_worker.factorization.factorize import Analysis
 from precond_worker.factorization.modified_cholesky import ModifiedCholesky
 from precond_worker.gpu.gpu_factorization import COPIES
 from precond_worker.many import GivenMatrices
+from precond_worker.symbolic import pivots
 from precond_worker.symbolic.blocks import BLOCK, pivot_threshold
 from precond_worker.symbolic.pivots import PivotCheck
 from protocol.refused import Refused
@@ -89,8 +90,11 @@ def test_one_whose_pivot_is_rounding_error_is_told_as_when_it_is_alone(analysis)
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
-def test_pivots_are_judged_by_the_diagonal_of_their_node(dtype):
+@pytest.mark.parametrize("code", ["native", "NumPy"])
+def test_pivots_are_judged_by_the_diagonal_of_their_node(dtype, code, monkeypatch):
     """As if entry by entry: each pivot's square is more than the threshold times the largest diagonal entry there."""
+    if code == "NumPy":
+        monkeypatch.setattr(pivots, "_native", lambda: None)
     analysis, blocks = Analysis(*BAR), diagonal_blocks(*BAR)
     check, pattern = PivotCheck(analysis.pattern, blocks), analysis.pattern
     rng, threshold = np.random.default_rng(2), pivot_threshold(dtype)
@@ -106,6 +110,9 @@ def test_pivots_are_judged_by_the_diagonal_of_their_node(dtype):
         expected.append(bool((made[pattern.diagonal].astype(float) ** 2 > threshold * entries).all()))
     assert check.sound(values, check.scales(matrices.reshape(len(matrices), -1))).tolist() == expected
     assert True in expected[1:] and False in expected
+    assert (check._library is None) == (code == "NumPy")
+    values[0, pattern.diagonal[7]] = np.nan
+    assert not check.sound(values, check.scales(matrices.reshape(len(matrices), -1)))[0]
 
 
 def test_a_matrix_of_another_size_is_left_to_be_done_alone(analysis):

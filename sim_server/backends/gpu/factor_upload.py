@@ -411,7 +411,7 @@ class FactorUpload:
         sources = [self._source(each) for each in given]
         if len(given) == 1 and isinstance(sources[0], DeviceValues):
             return [self._solver.planes_on_device(given[0].pattern, sources[0], self._multiprocessors)]
-        return self._solver.planes_of([(g.pattern, np.asarray(s)) for g, s in zip(given, sources, strict=True)])
+        return self._solver.planes_of([(g.pattern, _on_host(s)) for g, s in zip(given, sources, strict=True)])
 
     def _source(self, given: GivenFactor) -> NDArray[Any] | DeviceValues:
         """Returns values of a factor as its inverse is built from them: large ones are brought to the device first if
@@ -619,6 +619,10 @@ class FactorUpload:
             log.warning(
                 "object %r: a factor cannot be used on the GPU: %s; it goes on with %s", uploads.name, reason, held
             )
+
+
+def _on_host(values: NDArray[Any] | DeviceValues) -> NDArray[Any]:
+    return values if isinstance(values, np.ndarray) else np.asarray(values)
 
 
 def _tell(waiting: "Future[Applied | None] | None", applied: Applied | None) -> None:

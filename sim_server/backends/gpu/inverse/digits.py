@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from protocol.factor import FactorPattern
+from protocol.located import Located, address
 from protocol.validate import helping_threads
 from sim_server.arrays import Float64
 from sim_server.backends.compiler import native
@@ -42,8 +43,8 @@ def largest_responses(pattern: FactorPattern, values: Sequence[NDArray[np.floati
 
     Takes a few passes over L. From any thread, without Python's lock.
     """
-    numbers = [np.ascontiguousarray(each, np.float32) for each in values]
-    each = np.array([one.__array_interface__["data"][0] for one in numbers], np.uintp)
+    numbers = [_contiguous(each) for each in values]
+    each = np.array([address(one) for one in numbers], np.uintp)
     found = np.empty(len(numbers))
     arrays = pattern.super_start, pattern.row_start, pattern.rows, pattern.value_start, each, found
     threads = 1 + min(helping_threads(), len(numbers) // FEW)
@@ -51,6 +52,11 @@ def largest_responses(pattern: FactorPattern, values: Sequence[NDArray[np.floati
         len(numbers), len(pattern.super_start) - 1, *(a.ctypes.data for a in arrays), threads
     )  # fmt: skip
     return found
+
+
+def _contiguous(values: NDArray[np.floating]) -> NDArray[np.float32]:
+    known = isinstance(values, Located) and values.dtype == np.float32 and values.flags.c_contiguous
+    return values if known else np.ascontiguousarray(values, np.float32)
 
 
 def planes_of(factors: Sequence[tuple[FactorPattern, NDArray[np.floating]]]) -> list[int]:
