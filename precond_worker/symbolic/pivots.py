@@ -18,7 +18,8 @@ SOURCE = Path(__file__).with_suffix(".cpp")
 
 
 @cache
-def _native() -> c.CDLL | None:
+def native() -> c.CDLL | None:
+    """Returns the library; None where it is not to be had."""
     library, p, n = compiled(SOURCE), c.c_void_p, c.c_int64
     if library is not None:
         library.pivot_scales.restype = library.pivots_sound.restype = None
@@ -35,7 +36,7 @@ class PivotCheck:
     """
 
     def __init__(self, pattern: FactorPattern, diagonal_blocks: Int64):
-        self._library = _native()
+        self._library = native()
         nodes = pattern.permutation[::BLOCK] // BLOCK  # in the order of L
         self._blocks = np.ascontiguousarray(diagonal_blocks[nodes], np.int64)
         self._places = np.ascontiguousarray(pattern.diagonal, np.int64)
