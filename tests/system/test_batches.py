@@ -18,9 +18,8 @@ from protocol.messages_pb2 import FactorBatch, MatrixBatch
 from protocol.shared_memory.limits import obstacle
 from protocol.shared_memory.view import SlotMap
 from protocol.validate import checksum
-from sim_server.network import factor_intake, job_sender, worker_choice
+from sim_server.network import factor_decoder, factor_intake, job_sender, worker_choice
 from sim_server.network.batch_message import MOST_TOGETHER
-from sim_server.network.factor_decoder import FactorDecoder
 from sim_server.network.link import ServerLink
 from sim_server.network.send_queue import SendQueue
 from sim_server.updates.factor_source import Job
@@ -244,7 +243,7 @@ def test_an_error_that_no_check_foresees_costs_its_message_alone(
     if beside:
         monkeypatch.setattr(factor_intake, "LARGE_MESSAGE", 0)
     batch, refusals = stage.batch(), stage.driver.link.counters.refusals["unexpected"]
-    monkeypatch.setattr(FactorDecoder, "_taken", broken)
+    monkeypatch.setattr(factor_decoder, "native_copies", broken)
     stage.send(stage.answer(batch, [0, 2]))
     stage.driver.until(lambda: stage.failed() == {"a", "c"}, "the refusals")
     assert "was refused: factors of a and 1 more by worker hand: IndexError" in stage.driver.failures[0][1]
