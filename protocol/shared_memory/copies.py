@@ -16,7 +16,7 @@ import numpy as np
 import xxhash
 from numpy.typing import NDArray
 
-from protocol.located import address
+from protocol.shared_memory.located import address
 from protocol.validate import ALONE, all_finite, checksum, copied, helping_threads
 
 SOURCE = Path(__file__).with_name("copies.cpp")

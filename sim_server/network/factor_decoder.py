@@ -11,7 +11,6 @@ import numpy as np
 
 from protocol.channels import CHANNELS, MOST_JOBS, name_in
 from protocol.factor import Factor, FactorPattern, check_values
-from protocol.located import rows
 from protocol.messages_pb2 import DeviceSlot as DeviceSlotMessage
 from protocol.messages_pb2 import Factor as FactorMessage
 from protocol.messages_pb2 import FactorBatch, Topology
@@ -19,6 +18,7 @@ from protocol.messages_pb2 import FactorPattern as PatternMessage
 from protocol.messages_pb2 import Slot as SlotMessage
 from protocol.method import COMPLETE
 from protocol.refused import Refused
+from protocol.shared_memory.located import rows
 from protocol.shared_memory.pool import Slot
 from protocol.validate import (
     Sized,

@@ -7,7 +7,7 @@ import pickle
 import numpy as np
 import pytest
 
-from protocol.located import Located, address, rows
+from protocol.shared_memory.located import Located, address, rows
 from protocol.shared_memory.pool import Slot
 
 
