@@ -44,9 +44,13 @@ class PivotCheck:
         self._nonzeros = pattern.nonzeros
 
     def scales(self, matrices: Float64) -> Float64:
-        """Returns the largest diagonal entry of each node, in the order of L, (k, nodes), of matrices (k, 9 blocks)."""
+        """Returns the largest diagonal entry of each node, in the order of L, (k, nodes), of matrices (k, 9 blocks).
+        Raises ValueError for arrays that native code must not read."""
         count, size = matrices.shape
-        assert matrices.dtype == np.float64 and matrices.flags.c_contiguous and size >= self._least
+        if matrices.dtype != np.float64 or not matrices.flags.c_contiguous or size < self._least:
+            raise ValueError(
+                f"matrices of {size} numbers of {matrices.dtype}; allowed: float64, at least {self._least}"
+            )
         if self._library is None:
             entries = matrices.reshape(count, -1, BLOCK * BLOCK)[:, self._blocks, :: BLOCK + 1]
             return np.ascontiguousarray(np.abs(entries).max(axis=2))
@@ -56,10 +60,13 @@ class PivotCheck:
         return found
 
     def sound(self, values: NDArray[np.floating[Any]], scales: Float64) -> NDArray[np.bool_]:
-        """Returns whether all pivots of each factor, (k, nonzeros), are more than rounding error, (k,)."""
+        """Returns whether all pivots of each factor, (k, nonzeros), are more than rounding error, (k,). Raises as
+        `scales`."""
         count, size, threshold = *values.shape, pivot_threshold(values.dtype)
-        assert values.dtype in (np.float32, np.float64) and values.flags.c_contiguous and size == self._nonzeros
-        assert scales.shape == (count, len(self._blocks)) and scales.flags.c_contiguous
+        if values.dtype not in (np.float32, np.float64) or not values.flags.c_contiguous or size != self._nonzeros:
+            raise ValueError(f"factors of {size} numbers of {values.dtype}; allowed: {self._nonzeros}, contiguous")
+        if scales.shape != (count, len(self._blocks)) or not (scales.dtype == np.float64 and scales.flags.c_contiguous):
+            raise ValueError(f"scales {scales.shape} of {scales.dtype}; allowed: {(count, len(self._blocks))}, float64")
         if self._library is None:
             pivots = values[:, self._places].astype(np.float64).reshape(count, -1, BLOCK) ** 2
             return np.asarray((pivots > threshold * scales[:, :, None]).all(axis=(1, 2)))

@@ -250,7 +250,10 @@ class Dispatch(FactorSource):
                 self._counters.refuse(refusal)
             except Exception as error:  # whatever a message holds, the run goes on
                 self._counters.refuse(self._counters.unexpected(error, f"a message {str(sample.key_expr)[:200]!r}"))
-        self._intake.take_decoded()
+        try:
+            self._intake.take_decoded()
+        except Exception as error:
+            self._counters.refuse(self._counters.unexpected(error, "factors taken in beside the caller"))
         self._sender.give_back_sent()
         self._query_tokens()
         if self._clock() >= self._looked_at + LOOK_PERIOD:  # many jobs are submitted one after another

@@ -255,6 +255,24 @@ def test_an_error_that_no_check_foresees_costs_its_message_alone(
     assert stage.made() == {"b", "d"} and stage.driver.link.slots_lent == 0
 
 
+@pytest.mark.parametrize("beside", [False, True], ids=["at once", "in a thread"])
+def test_factors_are_used_and_their_jobs_over_though_taking_note_of_them_fails(
+    stage: Hand, beside: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def broken(*arguments: Any) -> None:
+        raise IndexError("index 7 is out of bounds")
+
+    if beside:
+        monkeypatch.setattr(factor_intake, "LARGE_MESSAGE", 0)
+    batch, refusals = stage.batch(), stage.driver.link.counters.refusals["unexpected"]
+    monkeypatch.setattr(stage.driver.link.dispatch._book.timing, "record_all", broken)
+    stage.send(stage.answer(batch))
+    stage.driver.until(lambda: all_are_back(stage), "the answers")
+    stage.check_factors()
+    assert len(stage.made()) == 4 and not stage.driver.failures and stage.driver.link.slots_lent == 0
+    assert stage.driver.link.counters.refusals["unexpected"] == refusals + 1
+
+
 def test_a_failed_job_is_told_with_its_reason(stage: Hand) -> None:
     batch = stage.batch()
     message = stage.answer(batch)

@@ -25,6 +25,7 @@ from sim_server.updates.driver import Driver
 from sim_server.updates.factor_source import Inline, Job
 from sim_server.updates.policies.free_running import MAX_REQUESTS, Adaptive
 from sim_server.updates.stats import flops
+from sim_server.updates.update_table import NONE
 from tests.scenes import bar, factor_of, simulation
 from tests.solver.solves import applied
 from tests.support.virtual_workers import VirtualWorkers
@@ -494,19 +495,35 @@ def test_a_large_factor_that_is_no_use_is_refused_beside_the_steps(sent):
     assert driver.bodies[0].failures.refused == 1 and not driver.bodies[0].job.in_flight
 
 
+def test_a_check_that_cannot_begin_refuses_the_factor_and_the_run_goes_on(sent, monkeypatch):
+    driver, factor, _ = sent
+
+    def full(*_):
+        raise RuntimeError("can't start new thread")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(driver, "_prepare", full)
+        driver.adopt([factor])
+    driver.advance(1)
+    assert driver.checks == [] and driver.bodies[0].job.checked == NONE and driver.bodies[0].failures.refused == 1
+
+
 @pytest.mark.parametrize("beside", [True, False], ids=["beside the steps", "at once"])
 def test_a_check_that_fails_by_itself_refuses_the_factor_and_the_run_goes_on(sent, monkeypatch, beside):
     driver, factor, go = sent
     if not beside:
         monkeypatch.setattr(driver_module, "LARGE", 1 << 40)
-    check = driver.check.reject_reasons
+    check, blamed = driver.check.reject_reasons, []
     go.set()
+    monkeypatch.setattr(driver.source, "factor_failed", lambda *each: blamed.append(each))
     monkeypatch.setattr(driver.check, "reject_reasons", lambda *_: {}["nose"])
     driver.adopt([factor])
     wait([each.reasons for each in driver.checks])
     assert driver.advance(2)["factor_step"].tolist() == [-1, -1]
     assert driver.bodies[0].failures.refused == 1 and not driver.checks
-    assert driver.bodies[0].failures.reported == {"that of w is not used: its check failed: KeyError: 'nose'"}
+    (reported,) = driver.bodies[0].failures.reported
+    assert reported.startswith("that of w is not used: its check failed: KeyError: 'nose' (test_policies.py")
+    assert driver.counters.refusals == {"unexpected": 1} and blamed == []
     monkeypatch.setattr(driver.check, "reject_reasons", check)
     driver.adopt([replace(factor, step=driver.engine.step)])
     wait([each.reasons for each in driver.checks])
