@@ -236,9 +236,10 @@ class Driver:
         """
         beside = self.policy.free and not now
         together: list[Factor] = []
+        chosen: set[str] = set()  # objects of these
         for factor in factors:
             state = self.by_name[factor.object]
-            if beside and not self._may_check(state, factor):
+            if beside and (factor.object in chosen or not self._may_check(state, factor)):
                 self._behind.append(factor)  # its job counts as in flight, so that none comes behind it
             elif factor.step <= state.factors.newest or state.frozen:
                 self.snapshots.release(state, factor.step)
@@ -247,6 +248,7 @@ class Driver:
                 self._check_beside([factor])
             else:
                 together.append(factor)
+                chosen.add(factor.object)
         if beside and len(together) >= MANY and together[0].worker != Inline.WORKER:
             self._check_beside(together)
         elif together:

@@ -22,6 +22,7 @@ from sim_server.network import factor_decoder, factor_intake, job_sender, worker
 from sim_server.network.batch_message import MOST_TOGETHER
 from sim_server.network.link import ServerLink
 from sim_server.network.send_queue import SendQueue
+from sim_server.network.worker_timing import WorkerTiming
 from sim_server.updates.factor_source import Job
 from tests.ports import free_endpoint
 
@@ -265,7 +266,7 @@ def test_factors_are_used_and_their_jobs_over_though_taking_note_of_them_fails(
     if beside:
         monkeypatch.setattr(factor_intake, "LARGE_MESSAGE", 0)
     batch, refusals = stage.batch(), stage.driver.link.counters.refusals["unexpected"]
-    monkeypatch.setattr(stage.driver.link.dispatch._book.timing, "record_all", broken)
+    monkeypatch.setattr(WorkerTiming, "record_all", broken)
     stage.send(stage.answer(batch))
     stage.driver.until(lambda: all_are_back(stage), "the answers")
     stage.check_factors()

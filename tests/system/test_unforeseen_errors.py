@@ -3,6 +3,7 @@
 
 import logging
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
@@ -92,7 +93,7 @@ def test_a_thread_that_cannot_start_costs_one_factor(
 
     with monkeypatch.context() as patch:
         patch.setattr(factor_intake, "LARGE", 0)
-        patch.setattr(driver.link.dispatch._intake._thread, "submit", full)
+        patch.setattr(ThreadPoolExecutor, "submit", full)
         round_of(driver, hand)
         unexpected(driver, 1)
     assert "can't start new thread" in driver.failures[0][1] and driver.link.dispatch.consecutive_failures() == {}
@@ -104,8 +105,11 @@ def test_an_error_at_the_end_of_a_decoding_costs_its_factor_alone(
 ) -> None:
     driver, hand = stage
     monkeypatch.setattr(factor_intake, "LARGE", 0)
+    leases = driver.link.dispatch.leases
+    match = leases.match_answer
+    calls = [match, broken]
     with monkeypatch.context() as patch:
-        patch.setattr(driver.link.dispatch._intake, "_end_decoding", broken)
+        patch.setattr(leases, "match_answer", lambda *each: (calls.pop(0) if calls else match)(*each))
         round_of(driver, hand)
         unexpected(driver, 1)
     assert [name for name, _ in driver.failures] == ["beam"]

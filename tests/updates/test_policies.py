@@ -486,6 +486,21 @@ def test_large_factors_are_checked_beside_the_steps(sent):
     assert driver.bodies[0].factors.used == 1 and driver.checks == []
 
 
+def test_of_two_factors_of_a_body_that_come_together_the_second_waits_for_the_check_of_the_first(sent, monkeypatch):
+    """Where many small ones are checked together."""
+    driver, factor, go = sent
+    monkeypatch.setattr(driver_module, "LARGE", 1 << 40)
+    monkeypatch.setattr(driver_module, "MANY", 1)
+    driver.adopt([factor, replace(factor, step=factor.step + 1)])
+    assert [len(each.factors) for each in driver.checks] == [1] and driver.bodies[0].job.checked == factor.step
+    go.set()
+    for newest in (factor.step, factor.step + 1):
+        wait([each.reasons for each in driver.checks])
+        driver.receive(driver.source, driver.adopt)
+        assert driver.bodies[0].factors.newest == newest
+    assert driver.bodies[0].factors.used == 2 and driver.bodies[0].job.checked == NONE
+
+
 def test_a_large_factor_that_is_no_use_is_refused_beside_the_steps(sent):
     driver, factor, go = sent
     driver.adopt([replace(factor, values=np.full_like(factor.values, np.nan))])
@@ -502,7 +517,7 @@ def test_a_check_that_cannot_begin_refuses_the_factor_and_the_run_goes_on(sent, 
         raise RuntimeError("can't start new thread")
 
     with monkeypatch.context() as patch:
-        patch.setattr(driver, "_prepare", full)
+        patch.setattr(driver.engine, "prepare_factor", full)
         driver.adopt([factor])
     driver.advance(1)
     assert driver.checks == [] and driver.bodies[0].job.checked == NONE and driver.bodies[0].failures.refused == 1
