@@ -156,7 +156,7 @@ class FactorDecoder:
         if pattern.nonzeros > (most := known.most_allowed):
             raise Refused(
                 f"FactorPattern.nonzeros is {pattern.nonzeros}; allowed for the {known.blocks} blocks of the matrix: "
-                f"at most {most}, {WORST_FILL} times what nested dissection leaves, or {ALWAYS_ALLOWED} if that is more",
+                f"at most {most}, the more of {ALWAYS_ALLOWED} and {WORST_FILL} times what nested dissection leaves",
                 "size",
             )
         while len(known.patterns) >= MAX_PATTERNS:
