@@ -75,7 +75,7 @@ def test_a_body_that_touches_nothing_any_more_has_no_nodes_set_back():
     record = sim.engine.records()[0]
     assert record["clipped"] > 0 and record["status"] == STATUS["CONTACT"]
     put(sim, sim.world.v, 0)
-    put(sim, sim.world.x, sim.world.x + (0, 1, 0))
+    put(sim, sim.world.x, sim.world.x + np.array((0, 1, 0)))
     sim.engine.run(1)
     record = sim.engine.records()[0]
     assert record["passes"] == 0 and record["clipped"] == 0 and record["status"] == STATUS["CONVERGED"]
