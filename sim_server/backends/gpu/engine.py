@@ -9,6 +9,7 @@ The graph holds the launches of the scene and the persistent solver, whose stop 
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future
+from contextlib import ExitStack
 from functools import partial
 from typing import Any, cast
 
@@ -79,6 +80,7 @@ class GpuEngine(DeviceLoop):
     def __init__(self, gpu: Gpu, given: EngineInput, records: int | None = None):
         device, arrays, cut = CudaDevice(gpu.cp), given.arrays, given.cut
         self.gpu, self._arrays, self._steps = gpu, arrays, device.step_stream
+        self._claim = ExitStack()  # of a second GPU, from the first to the second half of a step
         self.launches = cast(Sequence[DeviceLaunch], [*given.assemble, *given.integrate])
         results = HostResults.allocated(device, given)
         contact = results.contact
@@ -201,13 +203,17 @@ class GpuEngine(DeviceLoop):
 
     def assemble(self) -> None:
         """Runs the first half of one step, and copies the system matrix to the host."""
-        self._make_ready()
-        self.open_step()
-        with self._steps:
-            self.sequence.assemble()
-            values = self._arrays["values"]
-            values[...] = self.gpu.twin(values).get(stream=self._steps)
-        self._known = self.sequence.known(values)
+        self._claim.close()
+        with ExitStack() as claim:
+            claim.enter_context(alone(self.solver.features.helper))  # refused here, no step is half made
+            self._make_ready()
+            self.open_step()
+            with self._steps:
+                self.sequence.assemble()
+                values = self._arrays["values"]
+                values[...] = self.gpu.twin(values).get(stream=self._steps)
+            self._known = self.sequence.known(values)
+            self._claim = claim.pop_all()
 
     def factor_matrix(self, body: int) -> Float64:
         """Returns the values of A as last assembled, with the contacts that a factor is to know, (blocks, 3, 3)."""
@@ -223,10 +229,10 @@ class GpuEngine(DeviceLoop):
 
     def solve(self) -> None:
         """Runs the second half: solve, integration, records."""
-        self._factor_upload.settle()
-        self.renew_mail()
         graph = self._graphs.second_half
-        with alone(self.solver.features.helper):
+        with self._claim:
+            self._factor_upload.settle()
+            self.renew_mail()
             if graph:  # with branches, which only graphs have
                 graph.launch(self._steps)
             else:
