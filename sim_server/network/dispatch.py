@@ -229,9 +229,12 @@ class Dispatch(FactorSource):
         with self._lock:
             return self._choice.consecutive_failures()
 
-    def factor_failed(self, worker: str, object: str) -> None:
-        """Notes that a factor made by `worker` was rejected, or that solves had to abandon it."""
+    def factor_failed(self, worker: str, object: str, pattern: int | None = None) -> None:
+        """Notes that a factor made by `worker` was rejected, or that solves had to abandon it. pattern: its id, if it
+        was rejected"""
         with self._lock:
+            if pattern is not None:
+                self.decoder.on_rejected(object, pattern)
             self.reliability.on_failure(worker, object, self._clock())
 
     def factor_helped(self, worker: str, object: str) -> None:
