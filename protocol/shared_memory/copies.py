@@ -53,7 +53,7 @@ class Parts(NamedTuple):
         inside = (size >= 0) & (size <= most) & (self.begin >= 0) & (self.begin <= most - size)  # no sum may overflow
         if not inside.all():
             raise ValueError(f"parts of an array lie outside of its {most} bytes")
-        return (self.array.__array_interface__["data"][0] + self.begin).astype(np.uintp)
+        return (address(self.array) + self.begin).astype(np.uintp)
 
     def split(self, size: NDArray[np.int64]) -> list[NDArray[np.uint8]]:
         """Returns the bytes of each part. Raises as `addresses`."""
