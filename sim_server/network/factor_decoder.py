@@ -5,6 +5,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cache
+from typing import TypeVar
 from weakref import WeakValueDictionary
 
 import numpy as np
@@ -37,6 +38,8 @@ from sim_server.network.leases import InFlightJob
 from sim_server.network.native_copies import native_copies
 from sim_server.scene.size_limits import expected_values
 from sim_server.updates.factor_source import FactorMemory
+
+T = TypeVar("T")
 
 LARGE = 1 << 20  # bytes of a factor for which `memory` is asked
 WORST_FILL = 6  # over that of nested dissection; minimum degree orderings leave about twice as much
@@ -306,11 +309,8 @@ class FactorDecoder:
         self._unsized.discard(job.object)
         if job.method != COMPLETE:
             sizes = known.sizes.get(job.method, {})
-            if pattern.id not in sizes:  # replaced: another thread may read it
-                known.sizes[job.method] = {
-                    **dict(list(sizes.items())[1 - MAX_PATTERNS :]),
-                    pattern.id: pattern.nonzeros,
-                }
+            if pattern.id not in sizes:
+                known.sizes[job.method] = _with_last(sizes, pattern.id, pattern.nonzeros)
         elif pattern.id not in known.complete.sizes:
             self._share(known.complete, pattern)
         return Factor(job.object, job.epoch, job.step, job.warp, pattern, values, job.worker, seconds, remedy[:200])
@@ -334,8 +334,7 @@ class FactorDecoder:
 
     def _share(self, complete: CompleteFactors, pattern: FactorPattern) -> None:
         """Has all objects of a topology know the pattern of a complete factor of one of them."""
-        kept = [each for each in complete.patterns.items() if each[0] != pattern.id][1 - MAX_PATTERNS :]
-        complete.patterns = {**dict(kept), pattern.id: pattern}  # replaced: another thread may read it
+        complete.patterns = _with_last(complete.patterns, pattern.id, pattern)
         sizes = {**complete.sizes, pattern.id: pattern.nonzeros}
         complete.sizes = {id: size for id, size in sizes.items() if id in complete.patterns}
         self._unsized = self._unsized - complete.objects
@@ -390,6 +389,12 @@ class _AnswerColumns:
             list(message.seconds), list(message.nonzeros), list(message.patterns), list(message.checksums), remedies,
             (slot.segment, slot.offset, slot.generation),
         )  # fmt: skip
+
+
+def _with_last(entries: dict[int, T], id: int, value: T) -> dict[int, T]:
+    """Returns the last entries and this one behind them, MAX_PATTERNS in all. Another thread may read `entries`."""
+    others = [each for each in entries.items() if each[0] != id]
+    return {**dict(others[1 - MAX_PATTERNS :]), id: value}
 
 
 def _slot(job: InFlightJob) -> Slot:
