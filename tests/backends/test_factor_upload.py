@@ -709,5 +709,6 @@ def test_one_of_many_that_has_no_vectors_is_told_alone(many, caplog):
         upload.advance()
     assert [box.posted for box in boxes] == [1, 0, *range(3, len(boxes) + 1)]
     assert [r.message for r in caplog.records] == [
-        "object 'beam1': a factor cannot be used on the GPU: not enough GPU memory: no vectors; it goes on with block Jacobi"
+        "object 'beam1': a factor cannot be used on the GPU: not enough GPU memory: no vectors; "
+        "it goes on with block Jacobi"
     ]

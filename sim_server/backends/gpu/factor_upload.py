@@ -492,7 +492,8 @@ class FactorUpload:
                             made[place] = error
         finally:
             for each in chosen:
-                each.tell(None)
+                if each.applied is not None:
+                    each.tell(None)
         return made
 
     def _build_by(
@@ -525,7 +526,8 @@ class FactorUpload:
                 given, planes = chosen[place].given, chosen[place].planes
                 made[place] = UploadedFactor(inverse, storages[place], given.step, given.pattern, planes)
             for place, inverse in zip(some, inverses, strict=True):
-                self._apply(builder, inverse, chosen[place])
+                if chosen[place].given.r is not None:
+                    self._apply(builder, inverse, chosen[place])
 
     def _new_storages(self, builder: InverseBuilder, count: int) -> list[InverseStorage]:
         """Makes storages for several inverses at once; none for one, or where there is too little memory."""
@@ -541,8 +543,9 @@ class FactorUpload:
     def _apply(self, builder: InverseBuilder, inverse: PartitionedInverse, chosen: ChosenPlan) -> None:
         """Begins to apply an inverse for the check of its factor, which goes without where that cannot be done: the
         inverse is there all the same, and the device writes into its storage."""
-        if chosen.given.r is None or chosen.given.dropped:  # dropped: nobody would keep the memory that it comes to
+        if chosen.given.dropped:  # nobody would keep the memory that it comes to
             return
+        assert chosen.given.r is not None
         try:
             chosen.tell(builder.apply(inverse, chosen.given.r, self._multiprocessors))
         except Exception as error:
@@ -580,9 +583,11 @@ class FactorUpload:
             if isinstance(made, Exception):
                 errors += self._unusable(uploads, made)
                 continue
-            self._keep(uploads, made)
+            kind = made.kind
+            if not any(storage is made.storage for storage in uploads.storages.get(kind, ())):
+                self._keep(uploads, made)
             if given.wanted:
-                wanted.setdefault(made.kind, []).append((body, made))
+                wanted.setdefault(kind, []).append((body, made))
             else:
                 uploads.built = None if given.dropped else (made, given)
         for posted in wanted.values():
@@ -626,7 +631,7 @@ class FactorUpload:
         return []
 
     def _keep(self, uploads: BodyUploads, factor: UploadedFactor) -> None:
-        """Keeps the storage of a factor, and forgets those of kinds that are not used any more."""
+        """Keeps the new storage of a factor, and forgets those of kinds that are not used any more."""
         if factor.kind not in uploads.storages:
             in_use = uploads.in_use.kind if uploads.in_use else None
             outdated = [k for k in uploads.storages if k != in_use]
@@ -637,9 +642,7 @@ class FactorUpload:
             uploads.expected = None
             if outdated or factor.kind not in self._known:
                 self._forget_plans(factor.kind)
-        storages = uploads.storages.setdefault(factor.kind, [])
-        if all(storage is not factor.storage for storage in storages):
-            storages.append(factor.storage)
+        uploads.storages.setdefault(factor.kind, []).append(factor.storage)
 
     def _forget_plans(self, needed: InverseKind) -> None:
         """Forgets the plans of kinds that no body has. needed: one that is about to be used"""

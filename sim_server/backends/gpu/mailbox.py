@@ -4,6 +4,7 @@
 import ctypes as c
 from collections.abc import Sequence
 from functools import cache
+from itertools import repeat
 from typing import Any
 
 import numpy as np
@@ -95,10 +96,11 @@ class DeviceMailbox:
     """
 
     def __init__(self, loop: structs.GpuLoop, slot: structs.MailSlot):
-        self._loop, self._slot, self.number = loop, slot, 0
-        self._own = self.loop, self.address = c.addressof(loop), c.addressof(slot)
+        self.loop, self._slot, self.number = loop, slot, 0
+        self._own = _, self.address = c.addressof(loop), c.addressof(slot)
         self.size = int(slot.size)
-        self._kept: list[Any] = []  # mail in use, then mail posted
+        self._used: Any = None  # mail in use
+        self._waiting: Any = None  # mail posted, which may be in use since
         self._leaving: list[tuple[int, Any]] = []  # (steps after whose completion it is out of use, mail)
 
     def post(self, data: bytes, keep: Any = None, event: int | None = None) -> structs.Mail:
@@ -111,19 +113,23 @@ class DeviceMailbox:
         self.number += 1
         memory = c.create_string_buffer(data, len(data))
         mail = structs.Mail(c.addressof(memory), event, self.number, -1)
-        self.note(bool(_posting()(*self._own, c.addressof(mail))), (memory, mail, keep))
+        displaced = bool(_posting()(*self._own, c.addressof(mail)))
+        self.note(displaced, (memory, mail, keep), self.loop.step, self.loop.launched)
         return mail
 
-    def note(self, displaced: bool, kept: Any) -> None:
-        """Keeps what was posted last. displaced: what was posted before was not taken"""
+    def note(self, displaced: bool, kept: Any, step: int, launched: int) -> None:
+        """Keeps what was posted last.
+
+        displaced: what was posted before was not taken
+        step, launched: steps completed, and launched
+        """
         if self._leaving:
-            self._leaving = [(step, what) for step, what in self._leaving if step > self._loop.step]
-        if displaced:
-            self._kept.pop()  # never taken; the mail in use stays
-        elif len(self._kept) > 1:  # the last one was taken: those before it are out of use after the steps under way
-            self._leaving.append((int(self._loop.launched), self._kept[:-1]))
-            del self._kept[:-1]
-        self._kept.append(kept)
+            self._leaving = [each for each in self._leaving if each[0] > step]
+        if not displaced and self._waiting is not None:  # it was taken: what was used before leaves after those steps
+            if self._used is not None:
+                self._leaving.append((launched, self._used))
+            self._used = self._waiting
+        self._waiting = kept
 
     def withdraw(self) -> bool:
         """Takes back mail that was not copied to the device, while the loop stands still; True if there was any."""
@@ -131,7 +137,7 @@ class DeviceMailbox:
         back = back or bool(self._slot.pending)
         self._slot.pending = None
         if back:
-            self._kept.pop()
+            self._waiting = None
         return back
 
     @property
@@ -147,7 +153,7 @@ def post_all(
 
     data: bytes of each, (boxes, bytes)
     """
-    count, data = len(boxes), np.ascontiguousarray(data)
+    count, data, loop = len(boxes), np.ascontiguousarray(data), boxes[0].loop
     assert data.shape == (count, boxes[0].size)
     memory, displaced = (structs.Mail * count)(), np.empty(count, np.bool_)
     for box in boxes:
@@ -156,8 +162,9 @@ def post_all(
     table["bytes"], table["event"] = data.ctypes.data + data.shape[1] * np.arange(count), events
     table["number"], table["taken"] = [box.number for box in boxes], -1
     slots = np.array([box.address for box in boxes], np.uintp)
-    _posting_all()(boxes[0].loop, count, slots.ctypes.data, c.addressof(memory), displaced.ctypes.data)
-    mails = list(memory)
-    for box, mail, kept, displaces in zip(boxes, mails, keep, displaced.tolist(), strict=True):
-        box.note(displaces, (data, mail, kept))
+    own = c.addressof(loop), count, slots.ctypes.data, c.addressof(memory), displaced.ctypes.data
+    _posting_all()(*own)
+    mails, step, launched = list(memory), loop.step, loop.launched
+    for box, kept, displaces in zip(boxes, zip(repeat(data), mails, keep, strict=False), displaced.tolist(), strict=True):
+        box.note(displaces, kept, step, launched)
     return mails

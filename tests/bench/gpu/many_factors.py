@@ -49,17 +49,16 @@ def measure(
         scene = Problem(tets, beams=beams).write(Path(folder))
         sim = Simulation.load(scene, [f"solver.schedule={schedule}"], device=device)
     with Served(sim, worker) as served:
-        driver, adopted, cpu = served.driver, [0], 0.0
+        driver, cpu = served.driver, 0.0
         for body in sim.world.bodies[1:]:
             served.link.announce(messages.topology(sim, body))
-        driver.on_adopt.append(lambda factor: adopted.__setitem__(0, adopted[0] + 1))
         begun, came = time.monotonic(), float("nan")
         used, uses = np.full(beams, -1), np.zeros(beams, int)  # step of the factor in use, and how many were
         ready = float("nan")
         while uses.min() < 2 and time.monotonic() < (came + first if came == came else begun + PATIENCE):
             r = driver.pump()
             time.sleep(ROUND_PERIOD)
-            if adopted[0] and came != came:
+            if came != came and driver.table.used.any():
                 came = time.monotonic()
             for body, step in zip(*np.unique(np.stack([r["body"], r["factor_step"]]), axis=1), strict=True):
                 uses[body] += step > used[body]
@@ -67,14 +66,14 @@ def measure(
             if uses.min() and ready != ready:
                 ready = time.monotonic() - came
         without = int((uses == 0).sum())
-        end, records, count, threads = time.monotonic() + seconds, [], adopted[0], thread_seconds()
+        end, records, count, threads = time.monotonic() + seconds, [], int(driver.table.used.sum()), thread_seconds()
         while time.monotonic() < end:
             busy = time.thread_time()
             found = driver.pump()
             cpu += time.thread_time() - busy
             records.append({name: found[name].copy() for name in KEPT})
             time.sleep(ROUND_PERIOD)
-        count = adopted[0] - count
+        count = int(driver.table.used.sum()) - count
         spent = {
             name: 1e6 * (lasted - threads.get(name, 0.0)) / max(count, 1) for name, lasted in thread_seconds().items()
         }
