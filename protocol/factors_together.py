@@ -3,11 +3,13 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any, overload
+from typing import Any, TypeVar, overload
 
 from numpy.typing import NDArray
 
 from protocol.factor import Factor, FactorPattern
+
+T = TypeVar("T")
 
 
 @dataclass(eq=False, slots=True)
@@ -49,5 +51,11 @@ class FactorsTogether(Sequence[Factor]):
 
     def of(self, rows: Sequence[int]) -> "FactorsTogether":
         """Returns some of them."""
-        columns = self.objects, self.epochs, self.steps, self.warps, self.values, self.seconds, self.remedies
-        return FactorsTogether(self.pattern, self.worker, self.method, *([each[k] for k in rows] for each in columns))
+
+        def chosen(column: list[T]) -> list[T]:
+            return [column[k] for k in rows]
+
+        return FactorsTogether(
+            self.pattern, self.worker, self.method, chosen(self.objects), chosen(self.epochs), chosen(self.steps),
+            chosen(self.warps), chosen(self.values), chosen(self.seconds), chosen(self.remedies),
+        )  # fmt: skip

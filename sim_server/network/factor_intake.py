@@ -295,41 +295,40 @@ class FactorIntake:
         """Takes the factors of a message that passed all checks, unless their jobs are over, and notes why others did
         not."""
         decoded, by_slot = results(), (together.matrix_shared, True)
+        taken: list[tuple[list[InFlightJob], FactorsTogether]] = []
         for places, factors in decoded.good:
             jobs = [together.jobs[k] for k in places]
-            rows = [row for row, job in enumerate(jobs) if self._current(job) is not None]
+            rows = [row for row, job in enumerate(jobs) if self._is_current(job)]
             if len(rows) < len(jobs):
                 jobs, factors = [jobs[row] for row in rows], factors.of(rows)
             if rows:
-                self._take_all(jobs, factors, together.duration, by_slot)
+                taken.append((jobs, factors))
+        self.together += [factors for _, factors in taken]
+        try:
+            for _, factors in taken:
+                self._book.timing.record_all(factors.worker, factors.objects, together.duration, factors.seconds)
+        finally:  # they will be used
+            for jobs, factors in taken:
+                self._book.leases.finish_all(jobs, factors.seconds)
+        for jobs, factors in taken:
+            self._count(jobs[0], sum(values.nbytes for values in factors.values), by_slot, len(jobs))
         for k, refusal in decoded.refused:
-            if (job := self._current(together.jobs[k])) is not None:
+            if self._is_current(job := together.jobs[k]):
                 try:
                     self._take_factor(job, partial(_refuse, refusal), "", 0.0, by_slot)
                 except Refused as told:
                     self._counters.refuse(told)
 
-    def _take_all(
-        self, jobs: Sequence[InFlightJob], factors: FactorsTogether, duration: float, by_slot: tuple[bool, bool]
-    ) -> None:  # fmt: skip
-        """Takes factors of one message. jobs: that they answer"""
-        self.together.append(factors)
-        try:
-            self._book.timing.record_all(factors.worker, factors.objects, duration, factors.seconds)
-        finally:  # they will be used
-            self._book.leases.finish_all(jobs, factors.seconds)
-        self._count(jobs[0], sum(values.nbytes for values in factors.values), by_slot, len(jobs))
-
-    def _current(self, job: InFlightJob) -> InFlightJob | None:
-        """Returns a job whose factor was decoded, if it is waited for."""
+    def _is_current(self, job: InFlightJob) -> bool:
+        """True if the factor of a job, which was decoded, is waited for."""
         leases = self._book.leases
         if leases.by_object.get(job.object) is job and leases.by_worker.get(job.worker, {}).get(job.number) is job:
-            return job
+            return True
         try:
             leases.finish(leases.match_answer(job.number, job.worker, job.epoch))  # another worker has it now
         except Refused as refusal:
             self._counters.refuse(refusal)
-        return None
+        return False
 
     def _take_factor(
         self, job: InFlightJob, decode: Callable[[], Factor], failure: str, told: float, by_slot: tuple[bool, bool]

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: MIT
 """What is known of the updates of one body: its solves, the job in flight, failures and factors."""
 
+from __future__ import annotations
+
 from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple
 
@@ -321,6 +323,12 @@ class MadeFactors(NamedTuple):
     seconds: Sequence[float]
     workers: Sequence[str]
     regularized: Sequence[bool]
+
+    @classmethod
+    def of(cls, factors: Sequence[Factor]) -> MadeFactors:
+        """Returns it of factors."""
+        workers, regularized = [factor.worker for factor in factors], [bool(factor.remedy) for factor in factors]
+        return cls([factor.step for factor in factors], [factor.seconds for factor in factors], workers, regularized)
 
 
 def on_factors(states: Sequence[BodyUpdateState], table: UpdateTable, made: MadeFactors, step: int) -> list[bool]:

@@ -61,18 +61,14 @@ FACTOR = np.dtype(structs.Factor)
 class CheckedBody:
     """What the check needs of an object: its pattern, that of its factor, and where native code finds them.
 
-    row: its row in a table of addresses: of row_start, columns, the probe vector and the pattern of the factor
+    addresses: of row_start, columns, the probe vector and the pattern of the factor
     """
 
-    def __init__(self, row_start: Int32, columns: Int32, probe: Reals, pattern: FactorPattern, row: int):
-        self.row_start, self.columns, self.probe, self.pattern, self.row = row_start, columns, probe, pattern, row
+    def __init__(self, row_start: Int32, columns: Int32, probe: Reals, pattern: FactorPattern):
+        self.row_start, self.columns, self.probe, self.pattern = row_start, columns, probe, pattern
         self.nodes, self.nonzeros, self._native = len(row_start) - 1, pattern.nonzeros, NativePattern(pattern)
-
-    @property
-    def addresses(self) -> list[int]:
-        """Of its arrays."""
-        arrays = self.row_start, self.columns, self.probe
-        return [*(each.ctypes.data for each in arrays), c.addressof(self._native.native)]
+        arrays = (each.ctypes.data for each in (row_start, columns, probe))
+        self.addresses = (*arrays, c.addressof(self._native.native))
 
     def fits(self, row_start: Int32, columns: Int32, pattern: FactorPattern) -> bool:
         """True if the arrays are still those."""
@@ -103,7 +99,6 @@ class FactorCheck:
         self._vectors: dict[int, Reals] = {}  # probe vectors by size
         self._work = np.empty(0)
         self._bodies: dict[str, CheckedBody] = {}  # by object
-        self._addresses = np.zeros((0, 4), np.uintp)  # of their arrays
         self._lock = threading.Lock()  # of these
 
     def prepare(self) -> None:
@@ -218,7 +213,7 @@ class FactorCheck:
         objects, epochs, patterns, values, matrices = checked
         count, values = len(objects), [_contiguous(each) for each in values]
         bodies = [self._body(*each) for each in zip(objects, epochs, patterns, strict=True)]
-        row_start, columns, r, pattern = self._addresses[[body.row for body in bodies]].T.copy()
+        row_start, columns, r, pattern = np.array([body.addresses for body in bodies], np.uintp).T.copy()
         factors, nodes = np.zeros(count, FACTOR), np.array([body.nodes for body in bodies], np.int32)
         factors["pattern"], factors["values"] = pattern, addresses(values)
         factors["bytes"] = [each.itemsize for each in values]
@@ -237,11 +232,8 @@ class FactorCheck:
         row_start, columns = self._patterns.at(name, epoch)
         known = self._bodies.get(name)
         if known is None or not known.fits(row_start, columns, pattern):
-            row = len(self._bodies) if known is None else known.row
-            known = CheckedBody(row_start, columns, self._vector(3 * (len(row_start) - 1)), pattern, row)
-            if row >= len(self._addresses):
-                self._addresses = np.concatenate([self._addresses, np.zeros((row + 8, 4), np.uintp)])
-            self._bodies[name], self._addresses[row] = known, known.addresses
+            known = CheckedBody(row_start, columns, self._vector(3 * (len(row_start) - 1)), pattern)
+            self._bodies[name] = known
         return known
 
     def _vector(self, size: int) -> Reals:

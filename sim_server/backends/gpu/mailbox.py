@@ -4,7 +4,6 @@
 import ctypes as c
 from collections.abc import Sequence
 from functools import cache
-from itertools import repeat
 from typing import Any
 
 import numpy as np
@@ -155,16 +154,17 @@ def post_all(
     """
     count, data, loop = len(boxes), np.ascontiguousarray(data), boxes[0].loop
     assert data.shape == (count, boxes[0].size)
-    memory, displaced = (structs.Mail * count)(), np.empty(count, np.bool_)
+    memory: Any = (structs.Mail * count)()
+    displaced = np.empty(count, np.bool_)
     for box in boxes:
         box.number += 1
-    table = np.frombuffer(memory, MAIL)
+    table: NDArray[Any] = np.frombuffer(memory, MAIL)
     table["bytes"], table["event"] = data.ctypes.data + data.shape[1] * np.arange(count), events
     table["number"], table["taken"] = [box.number for box in boxes], -1
     slots = np.array([box.address for box in boxes], np.uintp)
     own = c.addressof(loop), count, slots.ctypes.data, c.addressof(memory), displaced.ctypes.data
     _posting_all()(*own)
     mails, step, launched = list(memory), loop.step, loop.launched
-    for box, kept, displaces in zip(boxes, zip(repeat(data), mails, keep, strict=False), displaced.tolist(), strict=True):
-        box.note(displaces, kept, step, launched)
+    for box, mail, kept, displaces in zip(boxes, mails, keep, displaced.tolist(), strict=True):
+        box.note(displaces, (data, mail, kept), step, launched)
     return mails
