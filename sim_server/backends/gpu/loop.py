@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from sim_server.arrays import Float64, Int64
+from sim_server.backends.base import Due
 from sim_server.backends.gpu import structs
 from sim_server.backends.gpu.mailbox import DeviceMailbox, library
 from sim_server.backends.gpu.structs import FRAME_COPIES, RECORD_TARGET
@@ -224,9 +225,9 @@ class DeviceLoop(Reports):
         self._check()
         return done
 
-    def wait(self) -> bool:
-        """Sleeps while paused and, in real time, until the next step is due; False if the loop is to stop."""
-        return bool(self._native.wf_gpu_wait(c.byref(self.loop)))
+    def wait(self) -> Due:
+        """Sleeps while paused and, in real time, until the next step is due."""
+        return Due(self._native.wf_gpu_wait(c.byref(self.loop)))
 
     def open_step(self) -> None:
         """Begins a step whose kernels the caller launches."""
