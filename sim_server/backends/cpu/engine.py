@@ -403,6 +403,10 @@ class CpuEngine(Reports):
         """The loop copies to where it is told."""
         return None
 
+    def request_matrices(self, bodies: Sequence[int]) -> None:
+        """Does nothing, as there is no such memory."""
+        return None
+
     def stage(self, changes: Sequence[ArrayChange]) -> list[ArrayChange]:
         """Returns the changes, which are ready."""
         return list(changes)

@@ -41,7 +41,7 @@ class Merged(Report):
         self._given, self.quick = last["header"], bool(last["arguments"].get("quick"))
         if several:
             self.say("Put together of several runs, the last one described above:")
-            self.table([_told(part) for part in self.parts])
+            self.table([{"run": number, **_told(part)} for number, part in enumerate(self.parts, 1)])
 
     def header(self) -> Row:
         """As given."""
