@@ -276,7 +276,7 @@ static bool finish_down_to(GpuLoop& l, int64_t under_way) {
 }
 
 // Waits until the next step is due, and finishes batches and copies under way meanwhile.
-static bool wait(GpuLoop& l) {
+static Due wait(GpuLoop& l) {
     return wait_until_due(l.rings, [&] {
         if (finish_down_to(l, 0)) publish(l);
         return l.matrix_step >= 0 || l.rings.frame_head.load() < l.frames_begun;
