@@ -115,7 +115,7 @@ class Maker:
         self.each_known.append(kept)
 
     def use(
-        self, bodies: list[int], pattern: SimpleNamespace, inverses: list[PartitionedInverse], planes: int,
+        self, bodies: list[int], planned: list[SimpleNamespace], inverses: list[PartitionedInverse], planes: int,
         steps: list[int],
     ) -> None:  # fmt: skip
         if self.unusable.intersection(bodies):
@@ -576,14 +576,14 @@ def many(parts, monkeypatch):
 class Mailbox:
     """A mailbox whose mail the test takes."""
 
-    taken, posted, row = False, 0, b""
+    taken, posted, row, count = False, 0, b"", 0
 
     @staticmethod
     def post_all(
         boxes: list["Mailbox"], data: np.ndarray, keep: list[Any], events: list[int]
     ) -> list[SimpleNamespace]:  # fmt: skip
         for box, row, kept in zip(boxes, data, keep, strict=True):
-            box.taken, box.posted, box.row = False, kept.step, row.tobytes()
+            box.taken, box.posted, box.row, box.count = False, kept.step, row.tobytes(), box.count + 1
         return [SimpleNamespace(taken=0) for _ in boxes]
 
 
@@ -641,6 +641,36 @@ def test_many_are_built_beside_the_caller(many):
     maker.thread.submit(lambda: None).result()
     upload.advance()
     assert [box.posted for box in boxes] == [v + 10 for v in values] and len(maker.storages) == 2 * len(boxes)
+
+
+def test_many_are_posted_by_the_thread_that_builds_them(many):
+    """Nobody has to look whether they are built."""
+    maker, upload, boxes = many
+    values = list(range(1, len(boxes) + 1))
+    post_all(upload, values)
+    maker.thread.submit(lambda: None).result()
+    assert [box.posted for box in boxes] == values
+    upload.advance()
+    assert [box.count for box in boxes] == [1] * len(boxes), "once"
+
+
+def test_what_fails_while_they_are_posted_is_told_to_who_serves_the_loop(many, monkeypatch):
+    maker, upload, boxes = many
+    post, broken = module.post_all, RuntimeError("broken")
+
+    def fails(*arguments: Any) -> Any:
+        raise broken
+
+    with monkeypatch.context() as patch:
+        patch.setattr(module, "post_all", fails)
+        post_all(upload, list(range(1, len(boxes) + 1)))
+        maker.thread.submit(lambda: None).result()
+    with pytest.raises(RuntimeError, match="broken"):
+        upload.advance()
+    upload.advance()
+    post_all(upload, values := [9] * len(boxes))
+    maker.thread.submit(lambda: None).result()
+    assert [box.posted for box in boxes] == values and module.post_all is post
 
 
 def test_of_several_of_one_body_among_many_the_last_one_is_used(many):

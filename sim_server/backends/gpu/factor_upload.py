@@ -60,6 +60,7 @@ class UploadedFactor(NamedTuple):
     step: int
     pattern: FactorPattern
     planes: int
+    planned: PlannedInverse
 
     @property
     def kind(self) -> InverseKind:
@@ -121,7 +122,8 @@ class ChosenPlan(NamedTuple):
         _tell(self.applied, applied)
 
 
-class Builds(NamedTuple):
+@dataclass(eq=False)
+class Builds:
     """Inverses that are built beside the caller.
 
     given: by body
@@ -207,6 +209,7 @@ class FactorUpload:
         self._lock = threading.RLock()
         self._waiting: dict[int, None] = {}  # bodies with a queued factor, those that wait longest first
         self._builds: list[Builds] = []  # under way beside the caller
+        self._errors: list[Exception] = []  # of posting what was built there
         self._known: set[InverseKind] = set()  # of which storages were made
 
     def expect(self, body: int, pattern: FactorPattern) -> None:
@@ -303,6 +306,8 @@ class FactorUpload:
     def advance(self) -> None:
         """Posts what was built beside the caller, and begins the builds that have waited for a storage."""
         with self._lock:
+            if self._errors:
+                raise self._errors.pop(0)
             for builds in [each for each in self._builds if each.made.done()]:
                 self._finish(builds)
             if self._waiting:
@@ -399,6 +404,8 @@ class FactorUpload:
     def _begin_beside(self, bodies: Sequence[int], together: bool = False) -> None:
         work = [self._take_queued(body) for body in bodies]
         builds = self._note([given for _, given, _ in work], bodies, together)
+        if together:
+            builds.made.add_done_callback(lambda _: self._finish_beside(builds))
         self._solver.beside(partial(self._choose_and_build, work, builds.made))
 
     def _note(self, given: Sequence[GivenFactor], bodies: Sequence[int], together: bool = False) -> Builds:
@@ -524,7 +531,7 @@ class FactorUpload:
             inverses = builder.build_many(values, [storages[place] for place in some], multiprocessors)
             for place, inverse in zip(some, inverses, strict=True):
                 given, planes = chosen[place].given, chosen[place].planes
-                made[place] = UploadedFactor(inverse, storages[place], given.step, given.pattern, planes)
+                made[place] = UploadedFactor(inverse, storages[place], given.step, given.pattern, planes, planned)
             for place, inverse in zip(some, inverses, strict=True):
                 if chosen[place].given.r is not None:
                     self._apply(builder, inverse, chosen[place])
@@ -560,9 +567,19 @@ class FactorUpload:
         idle = loop.realtime and 0 < loop.step_seconds < BUSY * loop.dt
         return None if idle else self._solver.spared
 
+    def _finish_beside(self, builds: Builds) -> None:
+        """Posts what was built in the thread that built it, unless that is done: mail is taken once the device has
+        built, and nobody need look at it before."""
+        with self._lock:
+            try:
+                if builds in self._builds:
+                    self._finish(builds)
+            except Exception as error:  # for who serves the loop
+                self._errors.append(error)
+
     def _finish(self, builds: Builds) -> None:
         """Posts what was built beside the caller."""
-        self._builds = [each for each in self._builds if each is not builds]
+        self._builds.remove(builds)
         if builds.made.exception() is not None:
             for body in builds.given:
                 self._uploads[body].building = None
@@ -598,9 +615,9 @@ class FactorUpload:
     def _use(self, built: Sequence[tuple[int, UploadedFactor]]) -> list[Exception]:
         """Posts factors of one kind; returns errors as `_unusable`."""
         bodies, factors = [body for body, _ in built], [made for _, made in built]
-        (_, _, _, pattern, planes), inverses = factors[0], [made.inverse for made in factors]
+        planned, inverses = [made.planned for made in factors], [made.inverse for made in factors]
         try:
-            self._solver.use(bodies, pattern, inverses, planes, [made.step for made in factors])
+            self._solver.use(bodies, planned, inverses, factors[0].planes, [made.step for made in factors])
         except Exception as error:
             if len(built) == 1:
                 return self._unusable(self._uploads[bodies[0]], error)

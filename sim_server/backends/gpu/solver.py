@@ -321,13 +321,6 @@ class PcgSolver:
         far = helper.plan(found, warps) if helper else None
         return PlannedInverse(DevicePlan(self.gpu, found, warps, 0 if self._helper else None, own), builder, far)
 
-    def plan(self, body: int, pattern: FactorPattern, planes: int) -> DevicePlan:
-        """Returns the plan of the inverse of factors of this pattern for a body; waits until it is made.
-
-        Raises ValueError if the pattern has no plan (inverse.plan.plan) or needs more shared memory than there is.
-        """
-        return self.begin_plan(body, pattern, planes).result().plan
-
     def reserve_vectors(self, body: int, plan: DevicePlan) -> bool:
         """Allocates the vectors of solves of a body with factors of this plan, unless they are there; returns whether
         it did. From any thread; the caller has them complete before a step reads them."""
@@ -343,24 +336,21 @@ class PcgSolver:
         return True
 
     def use(
-        self, bodies: Sequence[int], pattern: FactorPattern, inverses: Sequence[PartitionedInverse], planes: int,
-        steps: Sequence[int],
+        self, bodies: Sequence[int], planned: Sequence[PlannedInverse], inverses: Sequence[PartitionedInverse],
+        planes: int, steps: Sequence[int],
     ) -> None:  # fmt: skip
-        """Writes factors of one pattern into the host rows of bodies; each is in use once its row is uploaded."""
+        """Writes factors into the host rows of bodies; each is in use once its row is uploaded."""
         rows, chosen = self.bodies, list(bodies)
-        plans: dict[int, DevicePlan] = {}  # by number of thread blocks
-        for body in bodies:
-            if (blocks := self._blocks_of[body]) not in plans:
-                plans[blocks] = self.plan(body, pattern, planes)
-            if self._plan_in_row.get(body) is not plans[blocks]:
-                self._use_plan(body, plans[blocks], planes)
+        for body, made in zip(bodies, planned, strict=True):
+            if self._plan_in_row.get(body) is not made.plan:
+                self._use_plan(body, made.plan, planes)
         rows["matrix"][chosen] = [each.matrix for each in inverses]
         rows["scale"][chosen] = [each.scale for each in inverses]
         rows["factor_step"][chosen], rows["helper"][chosen] = steps, 0
         if self._helper:
-            for body, inverse in zip(bodies, inverses, strict=True):
+            for body, made, inverse in zip(bodies, planned, inverses, strict=True):
                 if inverse.far:
-                    self._use_far(body, pattern, inverse.far, planes)
+                    self._use_far(body, made, inverse.far)
 
     def _use_plan(self, body: int, device_plan: DevicePlan, planes: int) -> None:
         """Has a body use factors of another plan."""
@@ -372,11 +362,10 @@ class PcgSolver:
             row[name] = address
         self._factor_bytes[body] = device_plan.bytes
 
-    def _use_far(self, body: int, pattern: FactorPattern, far: FarInverse, planes: int) -> None:
+    def _use_far(self, body: int, planned: PlannedInverse, far: FarInverse) -> None:
         """Has a second GPU use its part of an inverse."""
-        assert self._helper is not None
-        planned, row = self.begin_plan(body, pattern, planes).result(), self.bodies[body]
-        assert planned.far is not None
+        assert self._helper is not None and planned.far is not None
+        row = self.bodies[body]
         row["helper"] = self._helper.use(row, far, planned.far, self._far_vectors[body, planned.plan.address])
 
     def _addresses(self, body: int, plan: DevicePlan) -> dict[str, int]:
