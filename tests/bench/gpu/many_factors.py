@@ -52,33 +52,25 @@ def measure(
     with Served(sim, worker) as served:
         for body in sim.world.bodies[1:]:
             served.link.announce(messages.topology(sim, body))
-        adopted = Adopted()
-        served.driver.on_adopt.append(adopted)
-        row = watched(served.driver.pump, adopted, beams, first, seconds)
+        table = served.driver.table
+        row = watched(served.driver.pump, lambda: int(table.used.sum()), beams, first, seconds)
     return {"beams": beams, "tets": tets, "worker": worker, "schedule": schedule, **row}
 
 
-class Adopted:
-    """How many factors the loop was given; called with each."""
-
-    count = 0
-
-    def __call__(self, factor: object) -> None:
-        self.count += 1
-
-
-def watched(pump: Callable[[], NDArray[Any]], adopted: Adopted, beams: int, first: float, seconds: float) -> Row:
+def watched(
+    pump: Callable[[], NDArray[Any]], adopted: Callable[[], int], beams: int, first: float, seconds: float
+) -> Row:
     """Measures for `seconds`, from when all beams use their second factor: some of the first ones are old, as they
     waited for the others. Begins `first` seconds at most after a first factor came, for which a worker on a GPU may
     compile its kernels, as the server does those that build inverses. pump: what the thread beside the loop does in
-    each round; returns records."""
+    each round; returns records. adopted: returns how many factors the loop was given."""
     begun, came, cpu = time.monotonic(), float("nan"), 0.0
     used, uses = np.full(beams, -1), np.zeros(beams, int)  # step of the factor in use, and how many were
     ready = float("nan")
     while uses.min() < 2 and time.monotonic() < (came + first if came == came else begun + PATIENCE):
         r = pump()
         time.sleep(ROUND_PERIOD)
-        if adopted.count and came != came:
+        if adopted() and came != came:
             came = time.monotonic()
         for body, step in zip(*np.unique(np.stack([r["body"], r["factor_step"]]), axis=1), strict=True):
             uses[body] += step > used[body]
@@ -86,14 +78,14 @@ def watched(pump: Callable[[], NDArray[Any]], adopted: Adopted, beams: int, firs
         if uses.min() and ready != ready:
             ready = time.monotonic() - came
     without = int((uses == 0).sum())
-    end, records, count, threads = time.monotonic() + seconds, [], adopted.count, thread_seconds()
+    end, records, count, threads = time.monotonic() + seconds, [], adopted(), thread_seconds()
     while time.monotonic() < end:
         busy = time.thread_time()
         found = pump()
         cpu += time.thread_time() - busy
         records.append({name: found[name].copy() for name in KEPT})
         time.sleep(ROUND_PERIOD)
-    count = adopted.count - count
+    count = adopted() - count
     spent = {name: 1e6 * (lasted - threads.get(name, 0.0)) / max(count, 1) for name, lasted in thread_seconds().items()}
     r = {name: np.concatenate([each[name] for each in records]) for name in KEPT}
     own = {name: column[r["factor_step"] >= 0] for name, column in r.items()}

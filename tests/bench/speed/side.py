@@ -219,7 +219,7 @@ def swinging(beams: int, tets: int, device: str, worker: str, first: float, seco
 
 def _swinging_older(beams: int, tets: int, device: str, worker: str, first: float, seconds: float) -> Answer:
     """The same of commits whose modules had other names: by the bench that they have for one body."""
-    from tests.bench.gpu.many_factors import Adopted, watched
+    from tests.bench.gpu.many_factors import watched
     from tests.bench.gpu.problem import Problem
 
     _tests_of(CHECKOUT)
@@ -229,12 +229,12 @@ def _swinging_older(beams: int, tets: int, device: str, worker: str, first: floa
     finally:
         _tests_of(HERE)
     load("many", Problem(tets, beams=beams).text(), [], device)
-    sim, adopted = scenes["many"], Adopted()
+    sim, adopted = scenes["many"], list[int]()
     with Served(sim, worker) as served:
         for body in sim.world.bodies[1:]:
             served.link.announce(describe.topology(sim, body))
-        served.driver.adopted = adopted
-        row = watched(served.driver.pump, adopted, beams, first, seconds)
+        served.driver.adopted = lambda factor: adopted.append(factor.step)
+        row = watched(served.driver.pump, lambda: len(adopted), beams, first, seconds)
     drop("many")
     return {"beams": beams, "tets": tets, "worker": worker, "schedule": "excess", **row}
 
