@@ -18,6 +18,7 @@ class FactorsTogether(Sequence[Factor]):
     place of an object for each, which is made for who asks for it.
 
     values: (nonzeros,) of each
+    reasons: why each is not to be used, empty if it is; None: they were not checked
     """
 
     pattern: FactorPattern
@@ -30,6 +31,7 @@ class FactorsTogether(Sequence[Factor]):
     values: list[NDArray[Any]]
     seconds: list[float]
     remedies: list[str]
+    reasons: list[str] | None = None
 
     def __len__(self) -> int:
         return len(self.objects)
@@ -58,4 +60,5 @@ class FactorsTogether(Sequence[Factor]):
         return FactorsTogether(
             self.pattern, self.worker, self.method, chosen(self.objects), chosen(self.epochs), chosen(self.steps),
             chosen(self.warps), chosen(self.values), chosen(self.seconds), chosen(self.remedies),
+            None if self.reasons is None else chosen(self.reasons),
         )  # fmt: skip

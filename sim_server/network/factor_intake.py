@@ -20,6 +20,7 @@ from sim_server.network.bookkeeping import Bookkeeping
 from sim_server.network.factor_decoder import DecodedFactors
 from sim_server.network.factor_fetch import AHEAD, FactorFetch
 from sim_server.network.leases import InFlightJob
+from sim_server.updates.factor_source import Check
 
 T = TypeVar("T")
 
@@ -81,6 +82,7 @@ class FactorIntake:
         self._beside: set[int] = set()  # numbers of their jobs
         self._fetches: set[int] = set()  # of these, the jobs whose factors come in parts
         self.wake: Callable[[], None] = lambda: None  # called in another thread when a factor is decoded
+        self.begin_check: Callable[[Sequence[tuple[str, int]]], Check | None] = lambda jobs: None  # (FactorSource)
 
     def fetched_from(self, worker: str) -> int:
         """Number of factors that are fetched from a worker part by part."""
@@ -134,9 +136,11 @@ class FactorIntake:
         good = [(place, job) for place, job in answers if not self._ends(message, place, job)]
         seconds = [message.seconds[place] for place, _ in good]
         together = DecodedTogether([job for _, job in good], seconds, message.matrix_shared, duration)
-        decode = partial(self._all_decoded, message, good)
+        decode: Callable[[], DecodedFactors] = partial(self._all_decoded, message, good)
         if 4 * sum(message.nonzeros) <= LARGE_MESSAGE:
             return self._guarded(together.jobs, partial(self._take_together, together, decode))
+        if (check := self.begin_check([(job.object, job.step) for job in together.jobs])) is not None:
+            decode = partial(_checked, decode, check)
         self._together.append((together, self._begun(self._messages, decode)))
         self._beside.update(job.number for job in together.jobs)
 
@@ -381,6 +385,14 @@ class FactorIntake:
 def _failure(message: FactorBatch, place: int) -> str:
     """Why a worker made no factor for a job of a batch; empty if it did."""
     return message.failures[place] if message.failures else ""
+
+
+def _checked(decode: Callable[[], DecodedFactors], check: Check) -> DecodedFactors:
+    """Returns factors of a message with what their check tells."""
+    decoded = decode()
+    for _, factors in decoded.good:
+        factors.reasons = check(factors)
+    return decoded
 
 
 def _no_factor() -> Factor:

@@ -97,10 +97,12 @@ class Driver:
         self.wake: Callable[[], None] = lambda: None  # called in another thread when `pump` has something to take up
         self.on_adopt: list[Callable[[Factor], Any]] = []  # called with every factor that the loop is given
         self.on_epoch: list[Callable[[Body, int], None]] = []  # called before the first job of an epoch of a body
+        self._many = ManyFactors(self)
         self.snapshots = SnapshotPool(simulation, self.source, self.policy.expected_latency)
+        if self.wants_factors and self.policy.free:
+            self.source.check_with(self._many.begin_check)
         self.useless_factors = UselessFactors(self)
         self.checks: list[FactorsUnderCheck] = []  # oldest first
-        self._many = ManyFactors(self)
         self._behind: list[Factor] = []  # that wait for the end of the check of the factor before them
         self._begin_checks()
         self._observer = SolveObserver(self)
@@ -257,7 +259,7 @@ class Driver:
             self._check_beside(together)
         elif together:
             at_once = [(f, self.snapshots.release(self.by_name[f.object], f.step)) for f in together]
-            self._take_up(together, self._reasons(len(at_once), self.check.reject_reasons, at_once))
+            self._take_up(together, self.reasons(len(at_once), self.check.reject_reasons, at_once))
         self.policy.on_job_end()
 
     def _may_check(self, state: BodyUpdateState, factor: Factor) -> bool:
@@ -274,7 +276,7 @@ class Driver:
 
         def begin() -> Future[list[str]]:
             applied = self._prepare(factors[0]) if len(factors) == 1 else None
-            return self._checker.submit(self._reasons, len(checked), self.check.reject_reasons, checked, applied)
+            return self._checker.submit(self.reasons, len(checked), self.check.reject_reasons, checked, applied)
 
         self._begin_check(factors, [memory for memory, _ in held], begin)
 
@@ -282,7 +284,7 @@ class Driver:
         self, factors: FactorsTogether, memory: Sequence[Float64 | None], matrices: Sequence[Float64 | None]
     ) -> None:  # fmt: skip
         """Begins to check factors beside the caller. memory, matrices: as of FactorsUnderCheck, and of FactorCheck"""
-        check = partial(self._checker.submit, self._reasons, len(factors), self.check.reject_together)
+        check = partial(self._checker.submit, self.reasons, len(factors), self.check.reject_together)
         self._begin_check(factors, memory, partial(check, factors, matrices))
 
     def _begin_check(
@@ -296,7 +298,7 @@ class Driver:
         reasons.add_done_callback(lambda _: self.wake())
         self.checks.append(FactorsUnderCheck(factors, memory, reasons))
 
-    def _reasons(self, count: int, check: Callable[..., list[str]], *arguments: Any) -> list[str]:
+    def reasons(self, count: int, check: Callable[..., list[str]], *arguments: Any) -> list[str]:
         """Returns why each of so many factors is not used, as a check tells. Whatever error it raises, none of them is,
         and the run goes on. From any thread."""
         try:
@@ -333,18 +335,22 @@ class Driver:
             for memory in check.memory:
                 if memory is not None:
                     self.snapshots.recycle(memory)
-            if self._many.take_up(check):
+            self.take_up(check.factors, check.reasons.result())
+
+    def take_up(self, factors: Sequence[Factor], reasons: Sequence[str]) -> None:
+        """Gives the loop factors whose check has ended. reasons: why each is not to be used; empty if it is"""
+        self.policy.on_job_end()
+        if isinstance(factors, FactorsTogether) and self._many.take_up(factors, reasons):
+            return
+        good, why = [], []
+        for factor, reason in zip(factors, reasons, strict=True):
+            if self.source.epoch(factor.object) not in (None, factor.epoch):
+                self.engine.drop_factor(self.by_name[factor.object].body.index, factor)
+                self.fail(factor.object, "it was of a mesh that was split since", step=factor.step)
                 continue
-            good, reasons = [], []
-            for factor, reason in zip(check.factors, check.reasons.result(), strict=True):
-                if self.source.epoch(factor.object) not in (None, factor.epoch):
-                    self.engine.drop_factor(self.by_name[factor.object].body.index, factor)
-                    self.fail(factor.object, "it was of a mesh that was split since", step=factor.step)
-                    continue
-                good.append(factor)
-                reasons.append(reason)
-            self.policy.on_job_end()
-            self._take_up(good, reasons)
+            good.append(factor)
+            why.append(reason)
+        self._take_up(good, why)
 
     def _take_up(self, factors: Sequence[Factor], reasons: Sequence[str]) -> None:
         """Puts factors into the mailboxes of their bodies. reasons: why each is not to be used; empty if it is."""

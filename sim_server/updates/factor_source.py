@@ -21,6 +21,8 @@ if TYPE_CHECKING:
     from precond_worker.factorization.registry import Factorization
 
 EXACT = Method()
+Check = Callable[[FactorsTogether], list[str]]
+"""Returns why each of some factors is not to be used; empty if it is. From any thread."""
 FactorMemory = Callable[[int, np.dtype[Any]], NDArray[Any]]
 
 
@@ -87,6 +89,13 @@ class FactorSource(Protocol):
 
     def use_memory(self, memory: FactorMemory) -> None:
         """Has large factors that arrive put into arrays that `memory` makes, of their number of values and type."""
+        return
+
+    def check_with(self, begin: Callable[[Sequence[tuple[str, int]]], Check | None]) -> None:
+        """Has factors that are taken in beside the caller checked there.
+
+        begin: for the answers to jobs (object, step); returns what checks their factors, or None. From any thread
+        """
         return
 
     def worker_count(self) -> int:

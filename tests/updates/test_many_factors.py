@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Factors of one message: checked and used together, each as if it had come alone."""
 
+from collections.abc import Callable
 from concurrent.futures import wait
 from dataclasses import replace
 from typing import Any
@@ -28,6 +29,7 @@ class Messages(FactorSource):
         self.together: list[FactorsTogether] = []
         self.over: set[str] = set()  # objects that were split since
         self.blamed: list[str] = []
+        self.begin_check: Callable[..., Any] = lambda jobs: None
 
     def ready(self) -> int:
         return 0
@@ -48,6 +50,9 @@ class Messages(FactorSource):
 
     def epoch(self, name: str) -> int | None:
         return 2 if name in self.over else 1
+
+    def check_with(self, begin: Callable[..., Any]) -> None:
+        self.begin_check = begin
 
     def factor_failed(self, worker: str, object: str, pattern: int | None = None) -> None:
         self.blamed.append(object)
@@ -102,6 +107,12 @@ def checked(driver: Driver) -> None:
         driver.receive(driver.source, driver.policy.on_factors)
 
 
+def checked_as_they_come(source: Messages, factors: FactorsTogether) -> FactorsTogether:
+    """As the thread that copies them does."""
+    check = source.begin_check(list(zip(factors.objects, factors.steps, strict=True)))
+    return replace(factors, reasons=check(factors))
+
+
 def told(driver: Driver) -> list[tuple[Any, ...]]:
     """What is known of each body."""
     return [
@@ -118,11 +129,13 @@ def spoilt(factors: FactorsTogether, places: list[int]) -> FactorsTogether:
     return replace(factors, values=values, remedies=["shifted" if k == 1 else "" for k in range(BODIES)])
 
 
+@pytest.mark.parametrize("early", [False, True], ids=["checked beside", "checked as they come"])
 @pytest.mark.parametrize("bad", [[], [0], [2, 5, BODIES - 1], list(range(BODIES))], ids=str)
-def test_together_they_are_used_or_refused_as_if_each_came_alone(bad):
+def test_together_they_are_used_or_refused_as_if_each_came_alone(bad, early):
     (one, alone), (many, together) = start(), start()
     alone.alone = list(spoilt(made(one), bad))
-    together.together = [spoilt(made(many), bad)]
+    factors = spoilt(made(many), bad)
+    together.together = [checked_as_they_come(together, factors) if early else factors]
     checked(one), checked(many)
     assert told(one) == told(many) and alone.blamed == together.blamed == [f"bar{k}" for k in bad]
     steps = [one.engine.run(1) and one.engine.records()["factor_step"].tolist()[-BODIES:] for _ in range(2)]
@@ -163,6 +176,40 @@ def test_those_that_wait_for_a_check_and_those_of_bodies_that_move_no_more_are_t
     checked(driver)
     assert [t.factors.newest for t in driver.bodies[:4]] == [*second.steps[:2], second.steps[2] + 1, second.steps[3]]
     assert [t.factors.used for t in driver.bodies[:4]] == [2, 2, 1, 2]
+
+
+def test_those_that_were_checked_as_they_came_are_used_at_once_however_few():
+    driver, source = start()
+    memory = driver.bodies[0].job.matrix[1]
+    source.together = [checked_as_they_come(source, made(driver).of([0, 3]))]
+    driver.receive(source, driver.policy.on_factors)
+    assert not driver.checks and driver.table.used[:4].tolist() == [1, 0, 0, 1]
+    assert driver.bodies[0].job.matrix is None and any(memory is each for each in driver.snapshots.free[memory.shape])
+
+
+def test_a_verdict_on_a_matrix_that_is_not_there_any_more_counts_for_nothing(monkeypatch):
+    """Its memory may have been written to while it was checked: each of them is checked again, without it."""
+    driver, source = start()
+    factors = checked_as_they_come(source, made(driver))
+    factors.reasons[4] = "spoilt meanwhile"
+    driver.snapshots.release(driver.bodies[4])
+    seen, check = [], driver.check.reject_reasons
+    monkeypatch.setattr(driver.check, "reject_reasons", lambda given, *more: seen.append(given) or check(given, *more))
+    source.together = [factors]
+    checked(driver)
+    assert (driver.table.used == 1).all() and source.blamed == []
+    assert [(factor.object, matrix) for given in seen for factor, matrix in given] == [("bar4", None)]
+
+
+@pytest.mark.parametrize("sent", [None, "another step", "positions"])
+def test_without_the_matrix_of_each_they_are_checked_later(sent):
+    driver, source = start()
+    step, values = driver.bodies[2].job.matrix
+    wrong = {None: None, "another step": (step + 1, values), "positions": (step, np.zeros((4, 3)))}
+    driver.bodies[2].job.matrix = wrong[sent]
+    jobs = [(state.body.name, state.job.sent) for state in driver.bodies]
+    assert source.begin_check(jobs) is None and source.begin_check(jobs[:2]) is not None
+    assert source.begin_check([("nobody", step)]) is None
 
 
 def test_few_are_taken_one_by_one():
