@@ -17,8 +17,9 @@ struct __align__(16) WarpSegment {
 };
 
 // Eight or sixteen rows of a part's matrix: `chunks` chunks of 8 rows x 32 columns from `chunk` on, then those of the other
-// eight rows. x: first entry of the vector; out: first result; elsewhere, -DHELPED: the other device reads the results, too.
-struct __align__(16) Tile { int chunk, x, chunks, out, rows, elsewhere, unused[2]; };
+// eight rows. x: first entry of the vector; out: first result; elsewhere, -DHELPED: the other device reads the results, too; before: chunks
+// of the tiles before it in its list.
+struct __align__(16) Tile { int chunk, x, chunks, out, rows, elsewhere, before, unused; };
 
 // First and number of the segments, tiles and chunks of a thread block.
 struct BlockRanges { int segment, segments, tile, tiles, chunk, chunks, unused[2]; };

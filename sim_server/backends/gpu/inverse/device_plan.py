@@ -72,7 +72,8 @@ def entry_index(plan: Plan, cut: NDArray[np.int32]) -> NDArray[np.int32]:
 
 
 def paired_tiles(tiles: NDArray[Any], start: NDArray[Any], planes: int) -> tuple[NDArray[np.int32], NDArray[np.int64]]:
-    """Joins tiles of 8 rows with the next 8 rows where they follow, (k, 8): chunk, x, chunks, out, rows, 0, 0, 0."""
+    """Joins tiles of 8 rows with the next 8 rows where they follow, (k, 8): chunk, x, chunks, out, rows, 0,
+    chunks of the tiles before it in its list, 0."""
     chunk, x, chunks, out = tiles.T.astype(np.int64)
     follows = np.zeros(len(tiles), bool)  # the one before, in the same list
     follows[1:] = (x[1:] == x[:-1]) & (out[1:] == out[:-1] + 8) & (chunk[1:] == chunk[:-1] + planes * chunks[:-1])
@@ -83,7 +84,10 @@ def paired_tiles(tiles: NDArray[Any], start: NDArray[Any], planes: int) -> tuple
     found[:, :4] = tiles
     found[:, 4] = 8 + 8 * np.append(second[1:], False)
     kept = np.concatenate([[0], np.cumsum(~second)])
-    return found[~second], kept[start]
+    found, start = found[~second], kept[start]
+    before = np.cumsum(found[:, 2]) - found[:, 2]
+    found[:, 6] = before - np.repeat(before[start[:-1][start[:-1] < len(found)]], np.diff(start)[np.diff(start) > 0])
+    return found, start
 
 
 def warps_per_tile(tiles: NDArray[Any], start: NDArray[Any], warps: int) -> NDArray[np.int32]:

@@ -14,6 +14,13 @@
 #ifndef CHUNKS_AT_ONCE
 #define CHUNKS_AT_ONCE 4
 #endif
+#ifndef UNDER_WAY
+#define UNDER_WAY 3  // 2 or 3 groups of so many chunks, for each warp: -DALONE, -DOPERANDS
+#endif
+// -DOPERANDS: the 16 bytes of a chunk that a lane loads are the left factor of one matrix instruction as they are: their columns 0, 1
+// and 4, 5 its row, columns 2, 3 and 6, 7 its row eight further down. So four columns of the right factor are used, the vector's halves
+// for the former and for the latter, and nothing is moved between registers.
+// -DEVEN_SHARES: the warps of a thread block have equal shares of the chunks of a phase, wherever in a tile they begin and end.
 constexpr int TILE_SUMS = 64;  // most partial products of shared tiles in a phase
 constexpr int PADDING = 32;    // entries behind vectors, to which padding refers
 #define LISTS 32768   // most bytes of a list that is copied to shared memory
@@ -61,6 +68,15 @@ __device__ __forceinline__ void put_halves(const SplitVector& to, int i, float v
     to.low[i] = half_of((v - of_half(high)) * LOW);
 }
 
+// Place of entry `lane` of a segment in the vector.
+__device__ __forceinline__ int entry_place(int lane) {
+#ifdef OPERANDS
+    return (lane & ~6) | (lane & 2) << 1 | (lane & 4) >> 1;  // of each eight: 0, 1, 4, 5, 2, 3, 6, 7
+#else
+    return lane;
+#endif
+}
+
 __device__ __forceinline__ unsigned shared_address(const void* p) { return (unsigned)__cvta_generic_to_shared(p); }
 
 // Loads 16 bytes of shared memory if `wanted`, else zeros, without a branch.
@@ -78,6 +94,27 @@ __device__ __forceinline__ uint4 shared_vector_load(unsigned from) {
     asm volatile("ld.shared.v4.u32 {%0, %1, %2, %3}, [%4];" : "=r"(v.x), "=r"(v.y), "=r"(v.z), "=r"(v.w) : "r"(from));
     return v;
 }
+
+#ifdef OPERANDS
+// Loads 16 bytes of a matrix, for which nothing else should leave L1, from the K-th chunk behind `from`.
+template <int K>
+__device__ __forceinline__ uint4 chunk_load(const uint4* from) {
+    uint4 v;
+    asm volatile("ld.global.nc.L1::no_allocate.v4.u32 {%0, %1, %2, %3}, [%4+%5];"
+                 : "=r"(v.x), "=r"(v.y), "=r"(v.z), "=r"(v.w) : "l"(from), "n"(512 * K));
+    return v;
+}
+
+// Loads 8 bytes of shared memory if `wanted`, else zeros, without a branch.
+__device__ __forceinline__ uint2 shared_pair_load(unsigned from, bool wanted) {
+    uint2 v;
+    asm volatile(
+        "{.reg .pred p; setp.ne.s32 p, %3, 0; mov.b32 %0, 0; mov.b32 %1, 0;\n"
+        "@p ld.shared.v2.u32 {%0, %1}, [%2];}"
+        : "=r"(v.x), "=r"(v.y) : "r"(from), "r"((int)wanted));
+    return v;
+}
+#endif
 
 // sum += a b: a of 16 rows x 16 columns, b of 16 x 8, of which two columns are used.
 __device__ __forceinline__ void multiply_add(float sum[4], unsigned a0, unsigned a1, unsigned a2, unsigned a3, unsigned b0, unsigned b1) {
@@ -157,8 +194,10 @@ struct PartitionedInverse {
         size = plan->size; phases = plan->phases; groups = plan->groups;
         vector.high = arena.take<unsigned short>(shared_plan->entries);
         vector.low = arena.take<unsigned short>(shared_plan->entries);
-#ifndef ALONE
+#if !defined(ALONE)
         tile_sums = arena.take<float>(16 * TILE_SUMS);
+#elif defined(EVEN_SHARES)
+        tile_sums = arena.take<float>(16 * 2 * WARPS);
 #endif
         const BlockRanges part = plan->block_ranges[index];
         lists = brought(plan->lists + index * (4 * phases + 2), 4 * phases + 2, arena);
@@ -258,7 +297,7 @@ struct PartitionedInverse {
 
     __device__ __forceinline__ void put(const WarpSegment& segment, float v, unsigned number, float unit) const {
         const int lane = threadIdx.x % 32;
-        put_halves(vector, segment.to + lane, unit * v);
+        put_halves(vector, segment.to + entry_place(lane), unit * v);
         if (segment.keep & 1) put_for_all(formed[segment.from + lane], v, number, segment.kind != 0);
     }
 
@@ -341,10 +380,246 @@ struct PartitionedInverse {
         } while (keep_polling(!all, spins));
 #pragma unroll
         for (int k = 0; k < N; ++k)
-            if (at + k * WARPS < last) put_halves(vector, segments[at + k * WARPS].to + lane, unit * v[k]);
+            if (at + k * WARPS < last) put_halves(vector, segments[at + k * WARPS].to + entry_place(lane), unit * v[k]);
     }
 
+    // Address of what this lane has of the vector's first 32 entries from x on.
+    __device__ __forceinline__ unsigned vector_address(int x) const {
+        const int lane = threadIdx.x % 32;
+        const unsigned short* half = (lane & 4 ? vector.low : vector.high) + x + 8 * (lane % 4);
+#ifdef OPERANDS
+        half += lane & 8 ? 4 : 0;
+#endif
+        return shared_address(half);
+    }
+
+    // Row `lane` (of sixteen) of what a warp has summed up, in lanes 0 to 15.
+    static __device__ __forceinline__ float row_of(const float sum[2][4]) {
+        const int lane = threadIdx.x % 32;
+#ifdef OPERANDS  // lanes 4 r and 4 r + 1: halves of row r; 4 r + 2 and 4 r + 3: of row r + 8
+        const float* own = sum[0];
+        float a = own[0], b = own[1], c = own[2], d = own[3];
+        if (lane & 2) { a = sum[1][0]; b = sum[1][1]; c = sum[1][2]; d = sum[1][3]; }
+        float part = lane & 1 ? c + d / LOW : a + b / LOW;
+        part += __shfl_xor_sync(ALL, part, 1);
+        return __shfl_sync(ALL, part, 4 * (lane % 8) + (lane & 8 ? 2 : 0));
+#else
+        const float upper = sum[0][0] + sum[1][0] + (sum[0][1] + sum[1][1]) / LOW;  // lane 4 r: row r
+        const float lower = sum[0][2] + sum[1][2] + (sum[0][3] + sum[1][3]) / LOW;  // and row r + 8
+        const float one = __shfl_sync(ALL, upper, 4 * (lane % 8)), two = __shfl_sync(ALL, lower, 4 * (lane % 8));
+        return lane & 8 ? two : one;
+#endif
+    }
+
+#ifdef EVEN_SHARES
+    // Chunks of all tiles of a phase, side by side; which of them a warp has: [share(w, total), share(w + 1, total)).
+    __device__ __forceinline__ int chunks_of(int first, int count) const {
+        return count > 0 ? tiles[first + count - 1].before + tiles[first + count - 1].chunks : 0;
+    }
+    static __device__ __forceinline__ int share(int warp, int total) { return total * warp / WARPS; }
+
+    // The tile in which chunk `at` of a phase lies.
+    __device__ __forceinline__ int tile_at(int first, int count, int at) const {
+        int found = first - 1;
+        for (int k = threadIdx.x % 32; k - (int)threadIdx.x % 32 < count; k += 32)
+            found += __popc(__ballot_sync(ALL, k < count && tiles[first + min(k, count - 1)].before <= at));
+        return found;
+    }
+
+    // Sum of the pieces of a tile that this warp began and later warps end, at chunk `end` of the phase.
+    __device__ __forceinline__ float joined(int warp, int total, int end) const {
+        const int lane = threadIdx.x % 32;
+        float value = tile_sums[16 * (2 * warp + 1) + lane];
+        for (int w = warp + 1; w < WARPS && share(w, total) < end; ++w)
+            if (share(w + 1, total) > share(w, total)) value += tile_sums[16 * 2 * w + lane];
+        return value;
+    }
+#endif
+
 #ifdef ALONE
+#if defined(OPERANDS) && defined(EVEN_SHARES)
+    // Chunks of a piece of a tile on their way to a warp: of its upper eight rows, and of its lower ones.
+    struct Group {
+        uint4 upper[CHUNKS_AT_ONCE], lower[CHUNKS_AT_ONCE];
+        unsigned vector;      // address of what this lane multiplies them by
+        int phase, count;     // count: of chunks
+        int piece;            // of the last group of a piece: rows, 64 if another warp has begun the tile, 128 end if one ends it; else 0
+        int out;              // where this lane's row goes
+        float scale;          // and its scale
+        bool last;            // of a plane
+    };
+
+    // The groups of a warp, one after another through all phases: others are on their way while one is multiplied, also from one phase to
+    // the next.
+    struct Stream {
+        Group group[UNDER_WAY];
+        int turn, phase, tile, next, high;  // high: end of the share in the phase, of which chunks before `next` are in pieces
+        int left, plane, length;            // chunks of the piece that are to be asked for; of a plane
+        int at, below;                      // next chunk of the storage; from a chunk to that of the lower rows
+        unsigned vector;
+        bool kept;                          // the tile is in shared memory
+    };
+
+    __device__ __forceinline__ void open(Stream& s) const {
+        s.turn = s.next = s.high = s.left = s.plane = 0;
+        s.phase = -1;
+#pragma unroll
+        for (int n = 0; n < UNDER_WAY; ++n) {
+#pragma unroll
+            for (int k = 0; k < CHUNKS_AT_ONCE; ++k) s.group[n].upper[k] = s.group[n].lower[k] = make_uint4(0, 0, 0, 0);
+            ask(s, s.group[n]);
+        }
+    }
+
+    // Goes on to the next piece of this warp. Returns false after the last one.
+    __device__ __forceinline__ bool next_piece(Stream& s) const {
+        while (s.next == s.high) {
+            if (s.phase + 1 >= phases) { s.phase = phases; return false; }
+            ++s.phase;
+            const int warp = threadIdx.x / 32, first = lists[phases + 1 + s.phase], count = lists[phases + 2 + s.phase] - first;
+            const int total = chunks_of(first, count);
+            s.next = share(warp, total);
+            s.high = share(warp + 1, total);
+            s.tile = tile_at(first, count, s.next) - 1;
+        }
+        const Tile tile = tiles[++s.tile];
+        const int from = s.next - tile.before, to = min(tile.chunks, s.high - tile.before);
+        s.length = s.left = to - from;
+        s.next += s.length;
+        s.plane = 0;
+        s.at = tile.chunk - begin + from;
+        s.below = tile.rows > 8 ? tile.chunks * planes : 0;  // rows that a tile has not are not used
+        s.kept = s.at - from + s.below + tile.chunks * planes <= near;
+        s.vector = vector_address(tile.x + 32 * from);
+        return true;
+    }
+
+    template <int K>
+    static __device__ __forceinline__ void far_chunks(Group& g, const uint4* upper, const uint4* lower) {
+        if constexpr (K < CHUNKS_AT_ONCE) {
+            if (K >= g.count) return;
+            g.upper[K] = chunk_load<K>(upper);
+            g.lower[K] = chunk_load<K>(lower);
+            far_chunks<K + 1>(g, upper, lower);
+        }
+    }
+
+    __device__ __forceinline__ void ask(Stream& s, Group& g) const {
+        if (s.left == 0 && !next_piece(s)) {
+            g.phase = phases;
+            return;
+        }
+        const int lane = threadIdx.x % 32;
+        g.phase = s.phase;
+        g.count = min(CHUNKS_AT_ONCE, s.left);
+        g.vector = s.vector;
+        if (s.kept) {
+            const unsigned a = shared_address(kept + lane) + 512 * s.at, b = a + 512 * s.below;
+#pragma unroll
+            for (int k = 0; k < CHUNKS_AT_ONCE; ++k)
+                if (k < g.count) {
+                    g.upper[k] = shared_vector_load(a + 512 * k);
+                    g.lower[k] = shared_vector_load(b + 512 * k);
+                }
+        } else {
+            const uint4 *a = matrix + (32 * s.at + lane), *b = a + 32 * s.below;
+            far_chunks<0>(g, a, b);
+        }
+        s.at += g.count;
+        s.vector += 64 * g.count;
+        s.left -= g.count;
+        g.piece = 0;
+        g.last = s.left == 0;
+        if (!g.last) return;
+        const Tile tile = tiles[s.tile];
+        if (++s.plane < planes) {
+            s.at += tile.chunks - s.length;
+            s.vector -= 64 * s.length;
+            s.left = s.length;
+            return;
+        }
+        const int end = tile.before + tile.chunks;
+        g.piece = tile.rows | (s.next - s.length > tile.before ? 64 : s.next < end ? 128 * end : 0);
+        g.out = tile.out + min(lane, tile.rows - 1);
+        if (s.phase < groups - 1) g.out = __ldg(plan->target + g.out);
+        else g.scale = __ldg(scale + g.out);
+    }
+
+    // Products of a phase; returns this thread's part of z . r.
+    __device__ __forceinline__ double multiply(int phase, const ResidualSource& from, unsigned number, float unit, Stream& s) const {
+        const int lane = threadIdx.x % 32, warp = threadIdx.x / 32;
+        const bool forward = phase < groups - 1;
+        const float back = 1 / unit;
+        float sum[2][4] = {}, total = 0, weight = 1, d_open = 0;
+        int open_piece = 0, open_out = 0;  // of a tile that this warp begins and others end
+        double zr = 0;
+        auto finish = [&](float value, int i, float d) {
+            if (forward) {
+                contributed[i].put(value, number);
+                return;
+            }
+            solved[i].put(value, number);
+            z[i].put(d * value, number);
+            if (d == 0) return;  // padding
+            float ri, qi = 0;
+            from.r[i].get(ri, from.r_number);
+            if (from.alpha != 0) product[i].get(qi, from.q_number);
+            zr += (double)value * (ri - from.alpha * qi);
+        };
+        auto take = [&](Group& g) {
+            uint2 v[CHUNKS_AT_ONCE];  // zero behind the last chunk, where a chunk of an earlier group is left
+#pragma unroll
+            for (int k = 0; k < CHUNKS_AT_ONCE; ++k) v[k] = shared_pair_load(g.vector + 64 * k, k < g.count);
+#pragma unroll
+            for (int k = 0; k < CHUNKS_AT_ONCE; ++k) {
+                const uint4 m = g.upper[k], n = g.lower[k];
+                multiply_add(sum[0], m.x, m.y, m.z, m.w, v[k].x, v[k].y);
+                multiply_add(sum[1], n.x, n.y, n.z, n.w, v[k].x, v[k].y);
+            }
+            const bool last = g.last;
+            const int piece = g.piece, i = g.out;
+            const float d = g.scale;
+            ask(s, g);
+            if (!last) return;
+            total += weight * row_of(sum);
+            weight /= LOW;
+            for (int k = 0; k < 4; ++k) sum[0][k] = sum[1][k] = 0;
+            if (piece == 0) return;
+            const float value = back * total;
+            total = 0;
+            weight = 1;
+            if (piece >= 128) { open_piece = piece; open_out = i; d_open = d; }
+            if (lane >= (piece & 63)) return;
+            if (piece < 64) finish(value, i, d);
+            else tile_sums[16 * (2 * warp + (piece >= 128)) + lane] = value;
+        };
+        for (;;) {
+            if (s.turn == 0) {
+                if (s.group[0].phase != phase) break;
+                take(s.group[0]);
+                __syncwarp();
+                s.turn = 1;
+            }
+            if (s.turn == 1) {
+                if (s.group[1].phase != phase) break;
+                take(s.group[1]);
+                __syncwarp();
+                s.turn = UNDER_WAY > 2 ? 2 : 0;
+            }
+            if constexpr (UNDER_WAY > 2) {
+                if (s.group[2].phase != phase) break;
+                take(s.group[2]);
+                __syncwarp();
+                s.turn = 0;
+            }
+        }
+        __syncthreads();
+        const int first = lists[phases + 1 + phase];
+        if (lane < (open_piece & 63))
+            finish(joined(warp, chunks_of(first, lists[phases + 2 + phase] - first), open_piece / 128), open_out, d_open);
+        return zr;
+    }
+#else
     // Chunks of a tile on their way to a warp: of its upper eight rows, and of its lower ones.
     struct Group {
         uint4 upper[CHUNKS_AT_ONCE], lower[CHUNKS_AT_ONCE];
@@ -482,15 +757,34 @@ struct PartitionedInverse {
         }
         return zr;
     }
+#endif
 #else
     // Sums over chunks [from, to) of this block's storage, and over those `second` further on, of the next eight rows; the
     // vector begins at `x`.
     template <bool NEAR>
     __device__ __forceinline__ void accumulate(int from, int to, int second, int x, float sum[2][4]) const {
         const int lane = threadIdx.x % 32;
-        const unsigned half = shared_address((lane & 4 ? vector.low : vector.high) + x + 8 * (lane % 4)), a = shared_address(kept + lane);
+        const unsigned half = vector_address(x), a = shared_address(kept + lane);
         const uint4* far = matrix + lane;
         for (int at = from; at < to; at += CHUNKS_AT_ONCE) {
+#ifdef OPERANDS
+            uint4 m[CHUNKS_AT_ONCE], n[CHUNKS_AT_ONCE];
+            uint2 v[CHUNKS_AT_ONCE];
+#pragma unroll
+            for (int k = 0; k < CHUNKS_AT_ONCE; ++k) {
+                const int c = min(at + k, to - 1);
+                m[k] = NEAR ? shared_vector_load(a + 512 * c) : __ldg(far + 32ll * c);
+                n[k] = NEAR ? shared_vector_load(a + 512 * (c + second)) : __ldg(far + 32ll * (c + second));
+                v[k] = shared_pair_load(half + 64 * (c - from), at + k < to);
+            }
+#pragma unroll
+            for (int k = 0; k < CHUNKS_AT_ONCE; ++k) {
+                multiply_add(sum[0], m[k].x, m[k].y, m[k].z, m[k].w, v[k].x, v[k].y);
+                multiply_add(sum[1], n[k].x, n[k].y, n[k].z, n[k].w, v[k].x, v[k].y);
+            }
+        }
+    }
+#else
             uint4 m[CHUNKS_AT_ONCE], n[CHUNKS_AT_ONCE], v[CHUNKS_AT_ONCE];
 #pragma unroll
             for (int k = 0; k < CHUNKS_AT_ONCE; ++k) {
@@ -506,10 +800,11 @@ struct PartitionedInverse {
             }
         }
     }
+#endif
 
     // Row `lane` (of sixteen) of a tile's product over its chunks [low, high), in lanes 0 to 15.
     __device__ __forceinline__ float product_of(const Tile& tile, int low, int high) const {
-        const int lane = threadIdx.x % 32, second = tile.rows > 8 ? tile.chunks * planes : 0, x = tile.x;
+        const int second = tile.rows > 8 ? tile.chunks * planes : 0, x = tile.x;
         float total = 0, weight = 1;
         for (int plane = 0; plane < planes; ++plane, weight /= LOW) {
             float sum[2][4] = {};
@@ -517,10 +812,7 @@ struct PartitionedInverse {
             const int kept_to = near - second, middle = to < kept_to ? to : from > kept_to ? from : kept_to;
             accumulate<true>(from, middle, second, x + 32 * low, sum);
             accumulate<false>(middle, to, second, x + 32 * (low + middle - from), sum);
-            const float upper = sum[0][0] + sum[1][0] + (sum[0][1] + sum[1][1]) / LOW;  // lane 4 r: row r
-            const float lower = sum[0][2] + sum[1][2] + (sum[0][3] + sum[1][3]) / LOW;  // and row r + 8
-            const float one = __shfl_sync(ALL, upper, 4 * (lane % 8)), two = __shfl_sync(ALL, lower, 4 * (lane % 8));
-            total += weight * (lane & 8 ? two : one);
+            total += weight * row_of(sum);
         }
         return total;
     }
@@ -529,7 +821,9 @@ struct PartitionedInverse {
     __device__ __forceinline__ double multiply(int phase, const ResidualSource& from, unsigned number, float unit) const {
         const int lane = threadIdx.x % 32, warp = threadIdx.x / 32;
         const int first = lists[phases + 1 + phase], count = lists[phases + 2 + phase] - first;
+#ifndef EVEN_SHARES
         const int parts = lists[2 * phases + 2 + phase];
+#endif
         const bool forward = phase < groups - 1;
         const float back = 1 / unit;
         double zr = 0;
@@ -564,6 +858,28 @@ struct PartitionedInverse {
                 for (unsigned spins = 0; keep_polling(!q.unpack(qi, from.q_number), spins);) q = product[i].load();
             zr += (double)value * (ri - from.alpha * qi);
         };
+#ifdef EVEN_SHARES
+        const int total = chunks_of(first, count), low = share(warp, total), high = share(warp + 1, total);
+        int open = 0;  // end of a tile that this warp begins and others end
+        for (int next = low, at = tile_at(first, count, low); next < high; ++at) {
+            __syncwarp();  // some lanes may still be in `finish`
+            const Tile tile = tiles[at];
+            const int begins = next - tile.before, end = tile.before + tile.chunks;
+            const int ends = min(tile.chunks, high - tile.before);
+            const bool opens = begins == 0, whole = opens && ends == tile.chunks;
+            if (opens && lane < tile.rows) look_up(tile, lane);
+            const float value = product_of(tile, begins, ends);
+            next = tile.before + ends;
+            if (lane >= tile.rows) continue;
+            if (whole) finish(back * value);
+            else tile_sums[16 * (2 * warp + opens) + lane] = value;
+            if (opens && !whole) open = end;
+        }
+        __syncthreads();  // now the vector has been read, too
+        if (open > 0) finish(back * joined(warp, total, open));
+        return zr;
+    }
+#else
         const int row = threadIdx.x;
         bool here = row < 16 * count;
         if (parts > 1 && here) {
@@ -590,5 +906,6 @@ struct PartitionedInverse {
         }
         return zr;
     }
+#endif
 #endif
 };
