@@ -81,6 +81,7 @@ ASSEMBLY = {  # bodies of functions whose text is for a GPU alone
     "shared_vector_load": "return *(const uint4*)(shared_memory + from);",
     "shared_pair_load": "return wanted ? *(const uint2*)(shared_memory + from) : uint2{};",
     "chunk_load": "return from[32 * K];",
+    "chunk_policy": "return 0;",
     "multiply_add": "matrix_product(sum, a0, a1, a2, a3, b0, b1);",
 }
 MATRIX = """
@@ -124,7 +125,7 @@ def compiled(folder: Path, *defined: str) -> c.CDLL:
     for name, body in ASSEMBLY.items():
         whole = rf"(__device__ __forceinline__ [\w ]+ {name}\([^)]*\) )(\{{[^\n]*\}}|\{{\n.*?\n\}})\n"
         inverse, found = re.subn(whole, lambda m, b=body: f"{m[1]}{{ {b} }}\n", inverse, flags=re.DOTALL)
-        assert found == 1 or name in ("shared_pair_load", "chunk_load"), name
+        assert found == 1 or name in ("shared_pair_load", "chunk_load", "chunk_policy"), name
     assert "asm" not in inverse
     for name, text in {"block_group.cuh": group, "partitioned_inverse.cuh": inverse}.items():
         (folder / name).write_text(text)

@@ -504,7 +504,11 @@ struct PcgSolver {
     }
 
     __device__ __forceinline__ double by_inverse(real alpha, double r2) {
+#ifdef FEW_REGISTERS
+        const PartitionedInverse HELD inverse = memory.inverse;
+#else
         const PartitionedInverse inverse = memory.inverse;
+#endif
         // a power of two that scales d r below 1, for the small range of float16
         const float unit = unit_for(r2 * memory.peak * memory.peak);
         ResidualSource from = {residuals(turn), r_number, q_number, fresh ? 0 : (float)alpha};  // the update is being applied

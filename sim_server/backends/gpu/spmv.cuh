@@ -25,7 +25,10 @@
 // A is symmetric to the bit, so that the blocks on and above its diagonal are enough: they are kept in shared memory, all of them or
 // those of a window of rows that moves down. Each block of A has a word: 65536 times the rank of the block that is kept, among
 // those of the body; whether it is transposed; its column.
-#define WARP_ROWS 8                  // rows that a warp multiplies at a time, each by four lanes
+#ifndef WARP_ROWS
+#define WARP_ROWS (WARPS > 8 ? 4 : 8)  // rows that a warp multiplies at a time
+#endif
+#define ROW_LANES (32 / WARP_ROWS)   // lanes that share a row: 4 or 8
 #define WINDOW_ROWS (WARP_ROWS * WARPS)  // of a slab of the window
 #define WINDOW_BLOCKS (17 * WINDOW_ROWS) // most blocks of A in it
 #define AHEAD 1                      // slabs on their way while one is multiplied
@@ -289,13 +292,13 @@ struct BlockRows {
         for (int k = 0; k < AHEAD; ++k) ask_upper(k, 0, 0);
     }
 
-    // Rows low, low + 1, ... of a warp: lane 4 n + h adds every fourth block of the n-th, from the h-th on. c_at: offset of the words from
-    // the block on that is `origin`-th. first, at: of the window (placed).
+    // Rows low, low + 1, ... of a warp: lane ROW_LANES n + h adds blocks h, h + ROW_LANES, ... of the n-th. c_at: offset of the words
+    // from the block on that is `origin`-th. first, at: of the window (placed).
     template <class Done>
     __device__ __forceinline__ void of_window(int low, int end, int origin, int c_at, int first, int at, Done done) const {
         const real *a_of = shared_at<real>(near_blocks), *v_of = shared_at<real>(near_values);
         const int* c_of = shared_at<int>(c_at);
-        const int lane = threadIdx.x % 32, h = lane % 4, node = low + lane / 4, size = ring;
+        const int lane = threadIdx.x % 32, h = lane % ROW_LANES, node = low + lane / ROW_LANES, size = ring;
         int k = 0, last = 0;
         if (node < end) {
             k = row_start[node] - origin + h;
@@ -303,7 +306,7 @@ struct BlockRows {
         }
         real sum[3] = {0, 0, 0};
 #pragma unroll 2
-        for (; k < last; k += 4) {
+        for (; k < last; k += ROW_LANES) {
             const unsigned word = c_of[k];
             const bool transposed = word & TRANSPOSED;
             int place = (int)(word >> 16) - first + at;
@@ -315,10 +318,9 @@ struct BlockRows {
             sum[2] += a[2 * row] * v0 + a[2 * row + column] * v1 + a[8] * v2;
         }
 #pragma unroll
-        for (int r = 0; r < 3; ++r) {
-            sum[r] += __shfl_xor_sync(ALL, sum[r], 1);
-            sum[r] += __shfl_xor_sync(ALL, sum[r], 2);
-        }
+        for (int r = 0; r < 3; ++r)
+#pragma unroll
+            for (int by = 1; by < ROW_LANES; by *= 2) sum[r] += __shfl_xor_sync(ALL, sum[r], by);
         if (node < end && h < 3) done(node, h, h == 0 ? sum[0] : h == 1 ? sum[1] : sum[2]);
     }
 #endif

@@ -85,8 +85,8 @@ def paired_tiles(tiles: NDArray[Any], start: NDArray[Any], planes: int) -> tuple
     found[:, 4] = 8 + 8 * np.append(second[1:], False)
     kept = np.concatenate([[0], np.cumsum(~second)])
     found, start = found[~second], kept[start]
-    before = np.cumsum(found[:, 2]) - found[:, 2]
-    found[:, 6] = before - np.repeat(before[start[:-1][start[:-1] < len(found)]], np.diff(start)[np.diff(start) > 0])
+    total = np.concatenate([[0], np.cumsum(found[:, 2])])
+    found[:, 6] = total[:-1] - np.repeat(total[start[:-1]], np.diff(start))
     return found, start
 
 

@@ -96,13 +96,27 @@ __device__ __forceinline__ uint4 shared_vector_load(unsigned from) {
 }
 
 #ifdef OPERANDS
+#ifdef EVICT_FIRST  // chunks are the first to leave L2, so that A stays there from one product to the next
+#define PASSING ".L2::cache_hint"
+#define PASSING_POLICY ", %6"
+#else
+#define PASSING ""
+#define PASSING_POLICY ""
+#endif
 // Loads 16 bytes of a matrix, for which nothing else should leave L1, from the K-th chunk behind `from`.
 template <int K>
-__device__ __forceinline__ uint4 chunk_load(const uint4* from) {
+__device__ __forceinline__ uint4 chunk_load(const uint4* from, [[maybe_unused]] unsigned long long policy) {
     uint4 v;
-    asm volatile("ld.global.nc.L1::no_allocate.v4.u32 {%0, %1, %2, %3}, [%4+%5];"
-                 : "=r"(v.x), "=r"(v.y), "=r"(v.z), "=r"(v.w) : "l"(from), "n"(512 * K));
+    asm volatile("ld.global.nc.L1::no_allocate" PASSING ".v4.u32 {%0, %1, %2, %3}, [%4+%5]" PASSING_POLICY ";"
+                 : "=r"(v.x), "=r"(v.y), "=r"(v.z), "=r"(v.w) : "l"(from), "n"(512 * K), "l"(policy));
     return v;
+}
+__device__ __forceinline__ unsigned long long chunk_policy() {
+    unsigned long long policy = 0;
+#ifdef EVICT_FIRST
+    asm volatile("createpolicy.fractional.L2::evict_first.b64 %0, 1.0;" : "=l"(policy));
+#endif
+    return policy;
 }
 
 // Loads 8 bytes of shared memory if `wanted`, else zeros, without a branch.
@@ -458,11 +472,13 @@ struct PartitionedInverse {
         int at, below;                      // next chunk of the storage; from a chunk to that of the lower rows
         unsigned vector;
         bool kept;                          // the tile is in shared memory
+        unsigned long long policy;
     };
 
     __device__ __forceinline__ void open(Stream& s) const {
         s.turn = s.next = s.high = s.left = s.plane = 0;
         s.phase = -1;
+        s.policy = chunk_policy();
 #pragma unroll
         for (int n = 0; n < UNDER_WAY; ++n) {
 #pragma unroll
@@ -495,12 +511,12 @@ struct PartitionedInverse {
     }
 
     template <int K>
-    static __device__ __forceinline__ void far_chunks(Group& g, const uint4* upper, const uint4* lower) {
+    static __device__ __forceinline__ void far_chunks(Group& g, const uint4* upper, const uint4* lower, unsigned long long policy) {
         if constexpr (K < CHUNKS_AT_ONCE) {
             if (K >= g.count) return;
-            g.upper[K] = chunk_load<K>(upper);
-            g.lower[K] = chunk_load<K>(lower);
-            far_chunks<K + 1>(g, upper, lower);
+            g.upper[K] = chunk_load<K>(upper, policy);
+            g.lower[K] = chunk_load<K>(lower, policy);
+            far_chunks<K + 1>(g, upper, lower, policy);
         }
     }
 
@@ -523,7 +539,7 @@ struct PartitionedInverse {
                 }
         } else {
             const uint4 *a = matrix + (32 * s.at + lane), *b = a + 32 * s.below;
-            far_chunks<0>(g, a, b);
+            far_chunks<0>(g, a, b, s.policy);
         }
         s.at += g.count;
         s.vector += 64 * g.count;
