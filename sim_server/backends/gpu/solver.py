@@ -184,6 +184,7 @@ class PcgSolver:
         if self.followed:
             self._work["split_step"] = cp.zeros(len(ranges), np.int64)
         fixed = 5120 if correction else 2048  # bytes: shared memory that pcg.cu declares, and the driver's
+        fixed += 1024 if self.threads > 256 else 0
         self._shared = (gpu.properties["sharedMemPerMultiprocessor"] // blocks - fixed - 1024) // 16 * 16
         self._helped = np.zeros(len(ranges), bool)
         if helper:
