@@ -11,11 +11,12 @@ from tests.backends.test_gpu_correction import grabbed, hold
 from tests.scenes import bar, simulation
 
 
-@pytest.fixture(scope="module", params=[8, 4])  # rows of a warp at a time
+@pytest.fixture(scope="module", params=[(8,), (4,), (4, "LEAN_WORDS")])  # rows of a warp at a time, and more
 def library(request, tmp_path_factory):
+    rows, *more = request.param
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(row_partition, "warp_rows", lambda warps: request.param)
-        yield compiled(tmp_path_factory.mktemp("alone"), SOLVE, "ALONE", f"WARP_ROWS={request.param}")
+        patch.setattr(row_partition, "warp_rows", lambda warps: rows)
+        yield compiled(tmp_path_factory.mktemp("alone"), SOLVE, "ALONE", f"WARP_ROWS={rows}", *more)
 
 
 def solved(library, monkeypatch, shared: int | None = None, window: int | None = None):

@@ -36,6 +36,8 @@
 #include "smoothing_state.cuh"
 #endif
 
+// -DLEAN_WORDS, with -DALONE: d r is written once, after the update, and a barrier stands before it is read; nothing else is exchanged of
+// r and A p. So twice as many words find room in shared memory.
 #ifdef ALONE
 #define HELD &
 #else
@@ -48,7 +50,7 @@ struct BlockMemory {  // static shared memory of a thread block: data that is th
     DevicePlan plan;
     BlockRows rows;
     PartitionedInverse inverse;
-    real* d;                       // (own, 3) scale of the own degrees of freedom, or null
+    Scale* d;                      // (own, 3) scale of the own degrees of freedom, or null
     real* diagonal;                // (own, 9) inverses of the diagonal blocks
     double peak;                   // largest scale
     int next, bad, rests;
@@ -211,8 +213,12 @@ struct PcgSolver {
         return z;
     }
 
-    static __device__ __forceinline__ FlagWord<float>* residuals(int half) {
+    static __device__ __forceinline__ FlagWord<float>* residuals([[maybe_unused]] int half) {
+#ifdef LEAN_WORDS
+        return memory.inverse.residual;
+#else
         return memory.inverse.residual + (long long)half * (memory.inverse.size + 32);
+#endif
     }
 
     // 1. r = b - A x for the x of the scene, as a pending update by alpha = 1: x = 0 + 1 x, r = b - 1 (A x). With alpha = 0 the
@@ -254,9 +260,11 @@ struct PcgSolver {
             pass.last[begin + k] = given ? (real)rk : -qk;
             if (given && first_of_solve) pass.first[begin + k] = (real)rk;
 #endif
+#ifndef LEAN_WORDS
             if (!packed) return;
             publish(turn, k, bk);
             publish(1 - turn, k, (real)rk);  // not b - A x from float words, which near the solution would be rounding errors
+#endif
         });
         r_number = group.number;
         into_three<2>(mine);
@@ -420,7 +428,9 @@ struct PcgSolver {
         rows.multiply([&](int node, int c, real q) {
             const int k = 3 * node + c;
             rows.keep_product(k, q, mine);
+#ifndef LEAN_WORDS
             if (packed) publish_product(k, q);
+#endif
         });
         q_number = group.number;
         into_three<4>(mine);
@@ -519,7 +529,10 @@ struct PcgSolver {
 #else
         fresh = false;
 #endif
-#if defined(ALONE) && defined(CORRECTED)
+#ifdef LEAN_WORDS
+        from = {residuals(0), group.number, 0, 0};
+        __syncthreads();  // it is published just before
+#elif defined(ALONE) && defined(CORRECTED)
         __syncthreads();  // a column is published just before
 #endif
         if (!fetched) fetch();

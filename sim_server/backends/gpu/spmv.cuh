@@ -38,6 +38,12 @@
 #define COLUMN -1
 #endif
 
+#ifdef LEAN_WORDS
+using Scale = float;
+#else
+using Scale = real;
+#endif
+
 struct BlockRows {
     int begin, own, halo;  // own nodes [begin, begin + own) of the body; nodes read
     const int* nodes;      // (halo,) of the body
@@ -47,7 +53,7 @@ struct BlockRows {
 #ifdef ERRORS
     real* before;          // (own, 3) x at the last look (iterate_error.cuh)
 #endif
-    real* scale;           // (own, 3) of the inverse, or null
+    Scale* scale;          // (own, 3) of the inverse, or null
     const int* row_start;  // (own + 1,), less `base`
     const int* columns;    // indices into the halo
     const real* blocks;
@@ -95,7 +101,7 @@ struct BlockRows {
         if (!bring_upper(s, (int)row, range, arena, others))
 #endif
             bring(s, (int)row, range, arena, others);
-        scale = inverted ? arena.take<real>(3 * own) : nullptr;
+        scale = inverted ? arena.take<Scale>(3 * own) : nullptr;
         r = taken(arena, s.own_vectors + 3 * row + all);
         q = taken(arena, s.own_vectors + 3 * row + 2 * all);
 #ifdef ALONE  // of all vectors it is used least

@@ -231,8 +231,12 @@ struct PartitionedInverse {
         residual = body.residual; product = body.product; z = body.z;
         formed = body.formed; solved = body.solved; contributed = body.contributed;
 #ifdef ALONE
+#ifdef LEAN_WORDS
+        words(residual, size + PADDING, arena);
+#else
         words(residual, 2 * (size + PADDING), arena);
         words(product, size + PADDING, arena);
+#endif
         words(z, size + PADDING, arena);
         words(solved, size + PADDING, arena);
         words(contributed, plan->contributions, arena);
@@ -293,7 +297,11 @@ struct PartitionedInverse {
             for (int k = 0; k < N; ++k) {
                 const int i = segments[min(at + k * WARPS, last - 1)].from + lane;
                 r[k] = from.r[i].load();
+#ifdef LEAN_WORDS  // there is no update to be applied
+                q[k] = r[k];
+#else
                 q[k] = product[i].load();
+#endif
             }
             all = true;
 #pragma unroll
