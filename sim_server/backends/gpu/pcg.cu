@@ -442,9 +442,52 @@ struct PcgSolver {
 #endif
     }
 
+#ifdef LEAN_WORDS
+    // x += alpha p, r -= alpha q. The loads of a few entries travel together, as stores are behind all of them, where there are registers.
+    __device__ __forceinline__ void update(real alpha) const {
+        const BlockRows HELD rows = memory.rows;
+        constexpr int MANY_ENTRIES = WARPS > 8 ? 1 : 3;
+        const int count = 3 * rows.own;
+        for (int first = threadIdx.x; first < count; first += MANY_ENTRIES * THREADS) {
+            real r[MANY_ENTRIES], x[MANY_ENTRIES], p[MANY_ENTRIES], q[MANY_ENTRIES];
+            float d[MANY_ENTRIES];
+            int at[MANY_ENTRIES];
+#pragma unroll
+            for (int n = 0; n < MANY_ENTRIES; ++n) {
+                const int k = min(first + n * THREADS, count - 1);
+                r[n] = rows.r[k];
+                if (alpha != 0) { x[n] = rows.x[k]; p[n] = rows.values[k]; q[n] = rows.q[k]; }
+                if (packed) { d[n] = (float)scale_of(k); at[n] = rows.position(k / 3) + k % 3; }
+            }
+#pragma unroll
+            for (int n = 0; n < MANY_ENTRIES; ++n) {
+                const int k = first + n * THREADS;
+                if (k >= count) break;
+                if (alpha != 0) {
+                    r[n] -= alpha * q[n];
+                    rows.r[k] = r[n];
+                    rows.x[k] = x[n] + alpha * p[n];
+                }
+                if (packed) residuals(0)[at[n]].put((float)(d[n] * r[n]), group.number);
+            }
+        }
+    }
+#endif
+
     // 3. 4. 5. 6. x += alpha p, r -= alpha q, z = P^-1 r; returns z . r. r2: |r|^2 after the update.
     __device__ __forceinline__ double precondition(int kind, real alpha, double r2) {
-        const BlockRows HELD rows = memory.rows;
+        [[maybe_unused]] const BlockRows HELD rows = memory.rows;
+#ifdef LEAN_WORDS
+#ifdef CORRECTED
+        if (column >= 0) {
+            for (int k = threadIdx.x; k < 3 * rows.own; k += THREADS) {
+                const CorrectionMemory& m = memory.correction;
+                publish(0, k, 3 * (m.node[column / 3] - rows.begin) + column % 3 == k);
+            }
+        } else
+#endif
+            update(alpha);
+#else
         for (int k = threadIdx.x; k < 3 * rows.own; k += THREADS) {
 #ifdef CORRECTED
             if (column >= 0) {
@@ -462,6 +505,7 @@ struct PcgSolver {
             }
             if (packed) publish(1 - turn, k, r);
         }
+#endif
 #ifdef BUDGETS
         double mine[2], zr[2];
 #else

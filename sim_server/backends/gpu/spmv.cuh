@@ -254,14 +254,19 @@ struct BlockRows {
         return place < ring ? place : place - ring;
     }
 
-    // Begins to copy the blocks of rows from the diagonal on, a row by each warp.
+#ifdef HALF_WARPS
+#define COPIED_BY 16  // lanes that copy a row
+#else
+#define COPIED_BY 32
+#endif
+    // Begins to copy the blocks of rows from the diagonal on, a row by each warp, or half of one.
     __device__ __forceinline__ void ask_rows(int low, int high, int first, int at) const {
-        const int lane = threadIdx.x % 32;
+        const int lane = threadIdx.x % COPIED_BY;
         real* window = (real*)(shared_memory + near_blocks);
-        for (int row = low + (int)threadIdx.x / 32; row < high; row += WARPS) {
+        for (int row = low + (int)threadIdx.x / COPIED_BY; row < high; row += THREADS / COPIED_BY) {
             const int rank = upper[row], count = 9 * (upper[row + 1] - rank), place = placed(rank, first, at), room = 9 * (ring - place);
             const real* from = blocks + 9ll * (row_start[row + 1] - base) - count;
-            for (int k = lane; k < count; k += 32) copy_async(window + 9 * place + (k < room ? k : k - 9 * ring), from + k, sizeof(real));
+            for (int k = lane; k < count; k += COPIED_BY) copy_async(window + 9 * place + (k < room ? k : k - 9 * ring), from + k, sizeof(real));
         }
     }
 
