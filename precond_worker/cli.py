@@ -5,7 +5,7 @@ import logging
 import os
 import socket
 import sys
-from threading import Event
+from contextlib import ExitStack
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -17,7 +17,8 @@ from protocol.process.exhausted import exhausted
 from protocol.process.nvidia import nvidia_device
 
 if TYPE_CHECKING:
-    from protocol.shared_memory.device_probe import OpenedMemory
+    from precond_worker.metrics import WorkerMetrics
+    from precond_worker.serving import WorkerOptions
 
 PROGRAM = Program("precond-worker")
 app = typer.Typer(pretty_exceptions_enable=False, rich_markup_mode=None)
@@ -96,8 +97,10 @@ def work(
 
             die_with_parent(parent)
         library = chosen_library(device, precision)
-        servers = ["sim"] if server is None else server
-        _serve(connect or [], threads, name or _default_name(), servers, not no_shared_memory, library, tls, metrics)
+        from precond_worker.serving import WorkerOptions
+
+        given = connect or [], threads, name or _default_name(), ["sim"] if server is None else server
+        _serve(WorkerOptions(*given, not no_shared_memory, library, tls, metrics))
     except NameTaken as error:
         PROGRAM.bad_input(str(error))
     except DeviceUnusable as error:
@@ -140,103 +143,54 @@ def chosen_library(device: str, precision: str) -> str:
     return "gpu" if precision == "auto" else f"gpu-{precision}"
 
 
-def _serve(
-    connect: list[str], threads: int, name: str, servers: list[str], shared_memory: bool, library: str,
-    tls: str | None, metrics: str | None,
-) -> None:  # fmt: skip
-    from contextlib import ExitStack
-    from functools import partial
-
+def _serve(options: "WorkerOptions") -> None:
     from precond_worker.factorization.block_columns import compile_ahead
-    from precond_worker.factorization.registry import make_factorization
     from precond_worker.main_loop import MainLoop
-    from precond_worker.network.server_addresses import ServerAddress, server_addresses
-    from precond_worker.network.server_connection import ServerConnection
-    from precond_worker.worker import Worker
-    from protocol.access.roles import identity_in, own_name
-    from protocol.channels import check_name
-    from protocol.counters import Counters
-    from protocol.network.endpoints import given_endpoints
-    from protocol.network.identity import usual_identity
-    from protocol.network.metrics_server import MetricsServer, metrics_address
-    from protocol.network.session import Session
+    from precond_worker.network.server_addresses import server_addresses
+    from precond_worker.serving import Serving, identified
+    from protocol.network.metrics_server import metrics_address
     from protocol.process.memory import keep_long_lived
     from protocol.process.notify import Notifier
-    from protocol.refused import Refused
 
     end_in_order()
     notifier = Notifier.of_environment()
     try:
-        own = [server.partition("@")[2] for server in servers if "@" in server]
-        identity = usual_identity(tls, ("worker",), [*connect, *own] or given_endpoints())
-        if identity is not None and identity.role != "worker":
-            text = f"the certificate {identity.name!r} was made for a {identity.role}"
-            print(f"precond-worker: {text}: a server that has it as one gives it no jobs", file=sys.stderr, flush=True)
-        if identity is not None and identity_in(name) != identity.name:
-            name = own_name(identity.name, name[len(identity.name) - 63 :])  # its end tells workers apart
-        check_name(name, "--name")
-        where = server_addresses(servers, connect, identity is not None)
-        metrics_at = None if metrics is None else metrics_address(metrics)
+        name, identity = identified(options)
+        addresses = server_addresses(options.servers, options.connect, identity is not None)
+        metrics_at = None if options.metrics is None else metrics_address(options.metrics)
     except ValueError as error:  # BadEndpoint or Refused
         PROGRAM.bad_input(str(error))
-    shown = library_title(library)
+    title = library_title(options.library)
     compile_ahead()
-    closing = ExitStack()
-    collected = None
-    if metrics_at is not None:
-        from precond_worker.metrics import WorkerMetrics
-
-        collected = WorkerMetrics(name, shown, threads)
-        try:
-            closing.enter_context(MetricsServer(*metrics_at, collected))
-        except Refused as error:
-            PROGRAM.bad_input(str(error))
-
-    def connection(session: Session, server: str, wake: Event) -> ServerConnection:
-        made = ServerConnection(
-            session, server, name, threads, shown, Counters(logging.getLogger("precond_worker")), wake,
-            opened_memory(library) if shared_memory else None,
-        )  # fmt: skip
-        if collected is not None:
-            collected.connections.append(made)
-        return made
-
-    def worker(connected: ServerConnection, address: ServerAddress) -> Worker:
-        def on_server(found: bool) -> None:
-            server = f"server {connected.server} at {address}"
-            if found:
-                count = f"{threads} thread{'s' if threads > 1 else ''}"
-                memory = "shared memory" if connected.shared_memory else "no shared memory"
-                print(f"precond-worker {name} ready: {shown}, {count}, {memory}, {server}", flush=True)
-            else:
-                print(f"precond-worker {name}: {server} is gone, waiting for it", file=sys.stderr, flush=True)
-
-        observe = (lambda seconds: None) if collected is None else collected.factorization.observe
-        return Worker(connected, partial(make_factorization, library=library), on_server, observe)
-
-    def left(connected: ServerConnection) -> None:
-        print(f"precond-worker {name}: leaves server {connected.server}, others need it more", flush=True)
-        if collected is not None:
-            collected.connections.remove(connected)
-
-    with closing, MainLoop(
-        where, shared_memory, connection, worker, identity, name, left, notifier.alive
-    ) as serving:  # fmt: skip
+    with ExitStack() as closing:
+        collected = None if metrics_at is None else _serve_metrics(closing, metrics_at, name, title, options.threads)
+        made = Serving(options, name, title, collected)
+        loop = MainLoop(
+            addresses, options.shared_memory, made.connection, made.worker, identity, name, made.left, notifier.alive
+        )
+        closing.enter_context(loop)
         keep_long_lived()
-        notifier.ready(f"{shown}, looking for {', '.join(servers)}")
+        notifier.ready(f"{title}, looking for {', '.join(options.servers)}")
         try:
-            serving.run()
+            loop.run()
         finally:
             notifier.stopping()
 
 
-def opened_memory(library: str) -> "OpenedMemory | None":
-    """Returns what opens device memory of servers; None: the library is one of the CPU."""
-    if not library.startswith("gpu"):
-        return None
-    from precond_worker.gpu.opened_memory import OpenedDeviceMemory
+def _serve_metrics(
+    closing: ExitStack, address: tuple[str, int], name: str, title: str, threads: int
+) -> "WorkerMetrics":  # fmt: skip
+    """Serves metrics until `closing`; ends the program if it cannot."""
+    from precond_worker.metrics import WorkerMetrics
+    from protocol.network.metrics_server import MetricsServer
+    from protocol.refused import Refused
 
-    return OpenedDeviceMemory()
+    collected = WorkerMetrics(name, title, threads)
+    try:
+        closing.enter_context(MetricsServer(*address, collected))
+    except Refused as error:
+        PROGRAM.bad_input(str(error))
+    return collected
 
 
 def library_title(library: str) -> str:

@@ -2,7 +2,9 @@
 """Counters of a link, with one warning for each kind of failure."""
 
 import logging
+import os
 import threading
+import traceback
 from collections import Counter
 
 from protocol.refused import Refused
@@ -28,6 +30,14 @@ class Counters:
         with self._lock:
             self.refusals[refusal.kind] += 1
         self.warn(f"refused:{refusal.kind}:{sender}", f"message refused: {refusal} (counted from now on)")
+
+    def unexpected(self, error: Exception, what: str) -> Refused:
+        """Returns the refusal of a message whose checks did not foresee an error, with the line that raised it. The
+        traceback is logged at debug level."""
+        self._logger.debug("%s: an error that no check foresees", what, exc_info=error)
+        last = traceback.extract_tb(error.__traceback__)[-1:]
+        where = "".join(f" ({os.path.basename(line.filename)}:{line.lineno})" for line in last)
+        return Refused(f"{what}: {type(error).__name__}: {str(error)[:500]}{where}", "unexpected")
 
     def trouble(self, name: str, text: str) -> None:
         """Counts a failure by name; the first one is logged."""

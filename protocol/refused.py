@@ -9,7 +9,7 @@ class Refused(ValueError):
 
     kind: by which receivers count refusals, one of
     malformed, version, incarnation, object, epoch, sequence, size, shape, not_finite, not_positive, checksum,
-    pattern, slot, late, duplicate, memory, worker, limit, secret, role, key.
+    pattern, slot, late, duplicate, memory, worker, limit, secret, role, key, unexpected (Counters.unexpected).
 
     Keys and values of the message are shown printable.
     """

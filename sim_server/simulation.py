@@ -67,6 +67,7 @@ class Simulation:
         self.scene = scene
         scene.check_device(device)
         backend = self.make_backend(device)
+        ahead("updates/update_table.cpp")
         if scene.solver.wants_factors:
             ahead("backends/cpu/native/factor_check.cpp")
         self.on_effect_update: list[Callable[[Effect, PendingUpdate], None]] = []
@@ -180,7 +181,7 @@ class Simulation:
         """From a scene file. Raises InputError, also for one beyond the limits."""
         scene = load(path, overrides)
         try:
-            limits.check(scene)
+            limits.check(scene, backends.bytes_of_copies(device, scene.solver.precision))
             return cls(scene, device)
         except DeviceError:
             raise

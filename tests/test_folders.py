@@ -18,8 +18,9 @@ ALLOWED = {  # what each folder imports of its package
     "protocol.process": set(),
     "protocol.shared_memory": {"channels", "refused", "validate"},
     "precond_worker.symbolic": {"arrays"},
-    "precond_worker.gpu": {"arrays", "errors", "symbolic"},
-    "precond_worker.factorization": {"arrays", "errors", "gpu", "symbolic"},
+    "precond_worker.gpu": {"arrays", "errors", "many", "symbolic"},
+    "precond_worker.factorization": {"arrays", "errors", "gpu", "many", "symbolic"},
+    "precond_worker.jobs": {"arrays", "errors", "factorization", "many", "network", "remote_assembly", "symbolic"},
     "precond_worker.network": {"errors", "remote_assembly"},
     "clients.commands": {
         "accuracy",

@@ -2,14 +2,15 @@
 """Cholesky factors of one object: the symbolic phase once per topology, the numeric phase once per matrix."""
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
-from precond_worker.arrays import Float64, Int32, Int64, Together
+from precond_worker.arrays import Float64, Int32, Int64
 from precond_worker.errors import NotPositiveDefinite
+from precond_worker.many import Begun, Matrices
 from precond_worker.symbolic.blocks import BLOCK, checked_pattern
 from protocol.factor import FactorPattern
 
@@ -37,11 +38,13 @@ class Library(Protocol):
 
 @runtime_checkable
 class ManyLibrary(Protocol):
-    """A library that factorizes up to `most` matrices together: GpuFactorization."""
+    """A library that factorizes up to `most` matrices in one call, of which `together` take hardly more time than one:
+    SupernodalFactorization, GpuFactorization."""
 
     most: int
+    together: int
 
-    def begin_many(self, matrices: Sequence[Float64], dtype: np.dtype[np.floating]) -> Together | None: ...
+    def begin_many(self, matrices: Matrices, dtype: np.dtype[np.floating]) -> Begun | None: ...
 
 
 @runtime_checkable
@@ -79,6 +82,7 @@ class Analysis:
         self._blocks = len(column)
         self._library = open_library(library, start, column)
         self.library, self.pattern = self._library.name, self._library.pattern
+        self._many = self._library if isinstance(self._library, ManyLibrary) else None
 
     def factorize(
         self, values: ArrayLike, dtype: DTypeLike = np.float32, out: NDArray[np.floating] | None = None
@@ -123,19 +127,21 @@ class Analysis:
 
     @property
     def most(self) -> int:
-        """Number of matrices that are factorized together."""
-        return self._library.most if isinstance(self._library, ManyLibrary) else 1
+        """Number of matrices that are factorized in one call."""
+        return 1 if self._many is None else self._many.most
 
-    def begin_many(self, values: Sequence[ArrayLike], dtype: DTypeLike = np.float32) -> Together | None:
+    @property
+    def together(self) -> int:
+        """Number of matrices that take hardly more time than one, factorized in one call."""
+        return 1 if self._many is None else self._many.together
+
+    def begin_many(self, matrices: Matrices, dtype: DTypeLike = np.float32) -> Begun | None:
         """Begins to factorize up to `most` matrices together, and may return before it is done; None if they must be
-        factorized one by one, as one of them is malformed. What is returned waits for the values of L, (k, nonzeros),
-        and returns None if one of them has no factor."""
-        matrices = [np.ascontiguousarray(each, np.float64) for each in values]
-        wanted = (self._blocks, BLOCK, BLOCK)
-        if not isinstance(self._library, ManyLibrary) or any(matrix.shape != wanted for matrix in matrices):
+        factorized one by one. Raises Refused for matrices that are found to be spoilt."""
+        if self._many is None or matrices.blocks != self._blocks:
             return None
         kind: np.dtype[Any] = np.dtype(dtype)
-        return self._library.begin_many(matrices, kind)
+        return self._many.begin_many(matrices, kind)
 
     def modified_ldl(self, matrix: Float64, dtype: DTypeLike, growth: float) -> tuple[NDArray[np.floating], int]:
         """Returns the values of L |D|^1/2 of a matrix that is not positive definite, and the number of negative pivots.

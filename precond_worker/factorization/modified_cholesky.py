@@ -7,16 +7,17 @@
    growth of LDL^T is out of bounds.
 """
 
-from collections.abc import Callable, Sequence
-from functools import partial
+from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
-from precond_worker.arrays import Float64, Together
+from precond_worker.arrays import Float64
 from precond_worker.errors import NotPositiveDefinite, OutOfRange
 from precond_worker.factorization.factorize import Analysis
-from precond_worker.symbolic.blocks import BLOCK, checked_pattern, node_norms, pivot_threshold, rows_of
+from precond_worker.many import Begun, Matrices
+from precond_worker.symbolic.blocks import checked_pattern, node_norms, pivot_threshold, rows_of
+from precond_worker.symbolic.pivots import PivotCheck
 from protocol.factor import FactorPattern
 
 SHIFT_FACTOR = 10  # of each shift over the one before; the first is relative to blocks.pivot_threshold
@@ -32,6 +33,7 @@ class ModifiedCholesky:
         start, column = checked_pattern(row_start, columns)
         self._row_start = start
         self._diagonal = np.flatnonzero(rows_of(start) == column)
+        self._check = PivotCheck(self.pattern, self._diagonal)
         self.remedy = ""
 
     @property
@@ -50,7 +52,7 @@ class ModifiedCholesky:
         matrix = np.ascontiguousarray(values, np.float64)
         try:
             made = self._analysis.factorize(matrix, dtype)
-            shifted = None if self._sound(made[None], [matrix]) else self._shifted(matrix, dtype)
+            shifted = None if self._sound(made, matrix) else self._shifted(matrix, dtype)
             return made if shifted is None else shifted
         except OutOfRange:
             raise
@@ -76,23 +78,19 @@ class ModifiedCholesky:
         """Number of matrices that are factorized together."""
         return self._analysis.most
 
-    def begin_many(self, values: Sequence[ArrayLike], dtype: DTypeLike = np.float32) -> Together | None:
-        """Begins to factorize up to `most` matrices together, as Analysis.begin_many. What is returned returns None
-        also if one of them may need a remedy."""
+    @property
+    def together(self) -> int:
+        """Number of matrices that take hardly more time than one, factorized together."""
+        return self._analysis.together
+
+    def begin_many(self, matrices: Matrices, dtype: DTypeLike = np.float32) -> Begun | None:
+        """Begins to factorize up to `most` matrices together, as Analysis.begin_many."""
         self.remedy = ""
-        made = self._analysis.begin_many(values, dtype)
-        return None if made is None else partial(self._end_many, made, [np.asarray(each) for each in values])
+        return self._analysis.begin_many(matrices, dtype)
 
-    def _end_many(self, end: Together, matrices: Sequence[Float64]) -> NDArray[np.floating] | None:
-        made = end()
-        return made if made is not None and self._sound(made, matrices) else None
-
-    def _sound(self, made: NDArray[np.floating], matrices: Sequence[Float64]) -> bool:
-        """True if every pivot of some factors (k, values), and their matrices, is more than rounding error."""
-        pivots = made[:, self.pattern.diagonal].astype(np.float64) ** 2
-        entries = np.array([matrix.reshape(-1, BLOCK * BLOCK)[self._diagonal] for matrix in matrices])
-        diagonal = np.abs(entries[:, :, :: BLOCK + 1]).max(axis=2)
-        return bool((pivots > pivot_threshold(made.dtype) * diagonal[:, self.pattern.permutation // BLOCK]).all())
+    def _sound(self, made: NDArray[np.floating], matrix: Float64) -> bool:
+        """True if every pivot of a factor, and its matrix, is more than rounding error."""
+        return bool(self._check.sound(made[None], self._check.scales(matrix.reshape(1, -1)))[0])
 
     def _modified_ldl(self, matrix: Float64, dtype: DTypeLike) -> NDArray[np.floating] | None:
         try:
@@ -112,7 +110,7 @@ class ModifiedCholesky:
                 made = self._analysis.factorize(more, dtype)
             except NotPositiveDefinite:
                 continue
-            if self._sound(made[None], [more]):
+            if self._sound(made, more):
                 self.remedy = f"diagonal shifted by {shift:g}"
                 return made
         return None

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from precond_worker.arrays import Float64, Int32, Int64
 from precond_worker.errors import NotPositiveDefinite, OutOfRange
 from precond_worker.factorization import blas
+from precond_worker.many import Begun, Made, Matrices
 from precond_worker.symbolic.assembly_tree import AssemblyTree, entries, maps
 from precond_worker.symbolic.blocks import BLOCK, pivot_threshold
 from precond_worker.symbolic.elimination import eliminate
@@ -25,6 +26,9 @@ from protocol.factor import FactorPattern
 
 SOURCE = Path(__file__).with_name("native") / "multifrontal.cpp"
 ROUGH = 1e-5  # least pivot over the diagonal of its node, below which float32 leaves less than two of its digits
+DOUBTLESS = 2  # smallest pivot over the threshold of rounding errors, from where L after rounding is not looked at
+MOST = 64  # matrices of a call
+OPERATIONS = 2e7  # multiplications of a call, a millisecond or two: answers wait for all of its matrices
 NOT_FINITE, PIVOT, RANGE, MEMORY = 1, 2, 3, 4  # enum Outcome; 0: made
 ARRAYS = ("own", "height", "parent", "run_start", "run", "entry_start", "entry_block", "entry_row", "row_start", "rows")
 
@@ -46,6 +50,9 @@ def native() -> c.CDLL:
     signatures: dict[str, tuple[Any, list[Any]]] = {
         "mf_new": (p, [c.POINTER(_Fronts)]), "mf_delete": (None, [p]),
         "mf_factorize": (_Result, [p, p, c.c_int64, flag, flag, p, c.POINTER(functions)]),
+        "mf_factorize_many": (
+            None, [p, c.c_int64, p, c.c_int64, flag, c.c_double, p, c.c_int64, *[c.POINTER(functions)] * 2, p]
+        ),
         "mf_signed": (_Result, [p, p, flag, p, p, c.POINTER(functions)]),
     }  # fmt: skip
     for name, (result, arguments) in signatures.items():
@@ -55,13 +62,13 @@ def native() -> c.CDLL:
 
 
 class SupernodalFactorization:
-    """Factors of one block pattern on one thread.
+    """Factors of one block pattern on one thread. most: matrices that `begin_many` takes at a time, one after another
 
     Arithmetic is in the type of L. Where float32 leaves too few digits, of which the smallest pivot tells, the factor
     is made again in float64 and rounded.
     """
 
-    name = "supernodal"
+    name, together = "supernodal", 1
 
     def __init__(self, row_start: Int32, columns: Int32):
         tree = assembly_tree(eliminate(row_start, columns, order_nodes(row_start, columns)))
@@ -70,6 +77,7 @@ class SupernodalFactorization:
         self._diagonal = self._arrays["entry_block"][self._arrays["entry_start"][:-1]]  # block of each node of L
         self._native = native()
         fronts = _Fronts(len(tree.parent), len(tree.order), *(self._arrays[name].ctypes.data for name in ARRAYS))
+        self.most = max(1, min(MOST, int(OPERATIONS / _operations(self.pattern))))
         self._work = self._native.mf_new(c.byref(fronts))
         if not self._work:
             raise MemoryError("no memory for a factorization")
@@ -94,6 +102,19 @@ class SupernodalFactorization:
         )
         return result
 
+    def begin_many(self, matrices: Matrices, dtype: np.dtype[np.floating]) -> Begun:
+        """Factorizes up to `most` matrices in one call of native code, with the values of L of `factorize`, to the bit.
+        Those are good whose pivots leave no doubt."""
+        count = len(matrices)
+        values, least = np.empty((count, self.pattern.nonzeros), dtype), np.empty(count)
+        at = matrices.addresses()
+        self._native.mf_factorize_many(
+            self._work, count, at.ctypes.data, matrices.blocks, dtype == np.float32, ROUGH, values.ctypes.data,
+            self.pattern.nonzeros, c.byref(blas.library("s")), c.byref(blas.library("d")), least.ctypes.data,
+        )  # fmt: skip
+        made = Made(values, least > DOUBTLESS * pivot_threshold(dtype))
+        return Begun(lambda: made, beside=False)
+
     def modified_ldl(
         self, matrix: Float64, dtype: np.dtype[np.floating], growth: float
     ) -> tuple[NDArray[np.floating], int]:
@@ -114,6 +135,13 @@ class SupernodalFactorization:
         if not (diagonal <= growth * np.repeat(scale, BLOCK)).all():
             raise NotPositiveDefinite("LDL^T without pivoting grows out of hand")
         return values, int(made.negative)
+
+
+def _operations(pattern: FactorPattern) -> float:
+    """Returns the multiplications of a factorization: half the sum of squares of the entries of L's columns."""
+    rows, columns = np.diff(pattern.row_start).astype(float), np.diff(pattern.super_start).astype(float)
+    below = rows - columns
+    return float((columns * below**2 + below * columns**2 + columns**3 / 3).sum()) / 2
 
 
 def _check(made: _Result, dtype: np.dtype[np.floating]) -> None:

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """A plan on the device: its tables and memory, and all launches of a factorization as one CUDA graph."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
 from typing import Any, NamedTuple
@@ -14,6 +14,7 @@ from precond_worker.errors import DeviceUnusable
 from precond_worker.gpu.device import cupy, kernels
 from precond_worker.gpu.plan import MultifrontalPlan
 from precond_worker.gpu.tables import KernelLaunch, front_table, launch_list
+from precond_worker.many import Matrices
 
 THREADS = {"assemble": 192, "store": 192}  # per block; 128 in the other kernels (multifrontal.cu)
 NONE = np.iinfo(np.int32).max
@@ -83,7 +84,8 @@ class Executor:
                 "entry_block": cp.asarray(plan.entry_block),
                 "entry_row": cp.asarray(plan.entry_row),
             }
-            self._sent = self._pinned(9 * plan.blocks, np.dtype(np.float64))
+            sent = self._pinned(9 * plan.blocks, np.dtype(np.float64))
+            self.sent: Float64 = sent.reshape(self._copies, -1)  # matrices of the last `begin`, until the next one
         except (cp.cuda.memory.OutOfMemoryError, cp.cuda.runtime.CUDARuntimeError) as error:
             self.__dict__.clear()
             memory.free_all_blocks()
@@ -121,7 +123,7 @@ class Executor:
             "store": (fronts, start, count, here, self._values, status),
         }[launch.kernel]
 
-    def run(self, matrices: Sequence[Float64]) -> tuple[NDArray[Any], Outcome]:
+    def run(self, matrices: Matrices) -> tuple[NDArray[Any], Outcome]:
         """Returns the values of L of each, (len(matrices), nonzeros), of block values (blocks, 3, 3), in an array of
         their own. Columns of L in the outcome are counted through all of them.
 
@@ -130,26 +132,27 @@ class Executor:
         """
         return self.begin(matrices)()
 
-    def begin(self, matrices: Sequence[Float64]) -> Callable[[], tuple[NDArray[Any], Outcome]]:
-        """Begins to factorize matrices; what is returned waits for it and returns what `run` does. Raises as `run`.
+    def begin(self, matrices: Matrices) -> Callable[[], tuple[NDArray[Any], Outcome]]:
+        """Begins to factorize matrices; what is returned waits for it and returns what `run` does. Raises as `run`, and
+        what `matrices` raise.
 
         Waits for what this executor began before.
         """
-        sent = self._sent.reshape(self._copies, -1)
-        count = len(matrices) if self._full else self._copies
-        values = self._pinned(len(matrices) * self.plan.nonzeros // self._copies, self._stored)
+        asked = len(matrices)
+        count = asked if self._full else self._copies
+        values = self._pinned(asked * self.plan.nonzeros // self._copies, self._stored)
         outcome = self._pinned(3, np.dtype(np.int32))
         with self._usable():
             self.stream.synchronize()
+            matrices.copy_to(self.sent[:asked])
+            self.sent[asked:count] = self.sent[asked - 1]  # at first, and after a failure, all places are taken
             self._running = values, outcome  # the device writes to them, whatever becomes of what is returned
-            for k in range(count):  # at first, and after a failure, also what takes the place of those that are missing
-                np.copyto(sent[k], matrices[min(k, len(matrices) - 1)].reshape(-1))
-            self._copy(self._blocks.data.ptr, sent.ctypes.data, sent[:count].nbytes)
+            self._copy(self._blocks.data.ptr, self.sent.ctypes.data, self.sent[:count].nbytes)
             self._graph.launch(self.stream)
             self._copy(outcome.ctypes.data, self._status.data.ptr, outcome.nbytes)
             self._copy(values.ctypes.data, self._values.data.ptr, values.nbytes)
         self._full = self._copies == 1  # until it is known that none failed
-        return partial(self._end, values.reshape(len(matrices), -1), outcome)
+        return partial(self._end, values.reshape(asked, -1), outcome)
 
     def run_on_device(self, matrix: int) -> Outcome:
         """Factorizes a matrix that is on the device, as `run`; L stays there (`pivots_are_sound`, `copy_values`).

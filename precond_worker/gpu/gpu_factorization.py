@@ -1,22 +1,24 @@
 # SPDX-License-Identifier: MIT
 """Complete factorizations on the GPU."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from precond_worker.arrays import Float64, Int32, Int64, Together
+from precond_worker.arrays import Float64, Int32, Int64
 from precond_worker.errors import NotPositiveDefinite, OutOfRange
 from precond_worker.gpu.assembly_tree import assembly_tree
 from precond_worker.gpu.copies import copies
 from precond_worker.gpu.device import best_precision, cupy, name, try_out
 from precond_worker.gpu.executor import Executor
 from precond_worker.gpu.plan import MultifrontalPlan, make_plan
-from precond_worker.symbolic.blocks import BLOCK
+from precond_worker.many import Begun, GivenMatrices, Made, Matrices
+from precond_worker.symbolic.blocks import BLOCK, rows_of
 from precond_worker.symbolic.elimination import eliminate
 from precond_worker.symbolic.ordering import order_nodes
+from precond_worker.symbolic.pivots import PivotCheck
 from protocol.factor import FactorPattern
 
 MOST = 64  # matrices that are factorized together
@@ -29,7 +31,7 @@ class GpuFactorization:
     """Factors of one block pattern on the current CUDA device.
 
     precision: auto, float32 or float64. L in float64 is always computed in float64.
-    most: matrices that `begin_many` takes at a time
+    most: matrices that `begin_many` takes at a time; they take hardly more time than one
     """
 
     def __init__(self, row_start: Int32, columns: Int32, precision: str = "auto"):
@@ -44,12 +46,13 @@ class GpuFactorization:
         self._executors: dict[tuple[str, int], list[Executor]] = {}
         bytes_of_one = 8 * self.pattern.nonzeros + 72 * len(columns)
         self.most = max(1, min(MOST, BYTES // bytes_of_one))
+        self._check = PivotCheck(self.pattern, np.flatnonzero(rows_of(row_start) == columns))
 
     def factorize(
         self, matrix: Float64, dtype: np.dtype[np.floating], out: NDArray[np.floating] | None
     ) -> NDArray[np.floating]:
         """Returns the values of L (factorize.Analysis.factorize). Raises MemoryError for lack of device memory."""
-        found, outcome = self.executor(dtype.name).run([matrix])
+        found, outcome = self.executor(dtype.name).run(GivenMatrices([matrix]))
         values: NDArray[np.floating] = found[0]
         if outcome.infinite:
             raise ValueError("matrix: values hold NaN or infinity, allowed: finite numbers")
@@ -88,27 +91,35 @@ class GpuFactorization:
         """Takes memory, makes the launches for matrices one by one, and tries them with zeros: the device then has all
         that it loads at first use, and page-locked memory is there for as many L as are at a time."""
         executor, zeros = self.executor(dtype.name), np.zeros((self.plan.blocks, 3, 3))
-        together = [executor.run([zeros]) for _ in range(AT_A_TIME)]
+        together = [executor.run(GivenMatrices([zeros])) for _ in range(AT_A_TIME)]
         del together
 
-    def begin_many(self, matrices: Sequence[Float64], dtype: np.dtype[np.floating]) -> Together | None:
-        """Begins to factorize up to `most` matrices in the launches of one; None if the device has too little memory.
+    @property
+    def together(self) -> int:
+        """Number of matrices that take hardly more time than one."""
+        return self.most
 
-        What is returned waits for the values of L, (k, nonzeros), and returns None if one matrix has none. Two such may
-        be under way.
+    def begin_many(self, matrices: Matrices, dtype: np.dtype[np.floating]) -> Begun | None:
+        """Begins to factorize up to `most` matrices in the launches of one; None if the device has too little memory.
+        If one of them has no factor, none is good.
+
+        Two such may be under way.
         """
         try:
-            run = self.executor(dtype.name, next(c for c in COPIES if c >= len(matrices))).begin(matrices)
+            executor = self.executor(dtype.name, next(c for c in COPIES if c >= len(matrices)))
+            run = executor.begin(matrices)
         except MemoryError:
             self.most = 1
             return None
+        scales = self._check.scales(executor.sent[: len(matrices)])  # while the device is at work
 
-        def end() -> NDArray[np.floating] | None:
+        def end() -> Made:
             values, outcome = run()
-            failed = outcome.infinite or outcome.pivot >= 0 or outcome.range >= 0
-            return None if failed else values
+            if outcome.infinite or outcome.pivot >= 0 or outcome.range >= 0:
+                return Made(values, np.zeros(len(values), np.bool_))
+            return Made(values, self._check.sound(values, scales))
 
-        return end
+        return Begun(end, beside=True)
 
     def modified_ldl(
         self, matrix: Float64, dtype: np.dtype[np.floating], growth: float

@@ -4,7 +4,7 @@
 import logging
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from functools import partial
 from queue import Full, Queue
 from typing import Any, NamedTuple
@@ -67,10 +67,12 @@ class OfferedFactors:
             self._asked[object] = self._clock()
         return part_checksums(data, part_bytes)
 
-    def withdraw(self, object: str) -> None:
-        """Drops the factor of an object, if there is one: it has been fetched, or nobody waits for it."""
+    def withdraw(self, objects: Iterable[str]) -> None:
+        """Drops the factors of objects, if there are any: they have been fetched, or nobody waits for them."""
         with self._lock:
-            self._offered.pop(object, None)
+            if self._offered:
+                for object in objects:
+                    self._offered.pop(object, None)
 
     def clear(self) -> None:
         """Drops all factors, when their server is gone."""

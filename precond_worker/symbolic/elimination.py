@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from precond_worker.arrays import Int32, Int64
 from precond_worker.symbolic.blocks import inverse_permutation, rows_of
+from precond_worker.symbolic.compiled import compiled
 
 SOURCE = Path(__file__).with_suffix(".cpp")
 
@@ -83,15 +84,8 @@ def eliminate(row_start: Int32, columns: Int32, order: Int64) -> Elimination:
 
 @cache
 def _library() -> c.CDLL | None:
-    """Compiled at the first call; None without a C++ compiler or the code of the server, which knows how to."""
-    try:
-        from sim_server.backends.build_pool import CompileError
-        from sim_server.backends.compiler import build
-    except ImportError:
-        return None
-    try:
-        library, p, n = c.CDLL(str(build(SOURCE, stepping=False))), c.c_void_p, c.c_int64
-    except CompileError:
+    library, p, n = compiled(SOURCE), c.c_void_p, c.c_int64
+    if library is None:
         return None
     signatures: dict[str, tuple[Any, list[Any]]] = {
         "eliminate_columns": (p, [n, *[p] * 8]), "eliminate_rows": (None, [p, p]), "eliminate_free": (None, [p])

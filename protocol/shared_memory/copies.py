@@ -10,15 +10,17 @@ from collections.abc import Sequence
 from functools import cache
 from importlib import import_module
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import xxhash
 from numpy.typing import NDArray
 
+from protocol.located import address
 from protocol.validate import ALONE, all_finite, checksum, copied, helping_threads
 
 SOURCE = Path(__file__).with_name("copies.cpp")
+SHARED = ALONE // 2  # bytes from where on threads share the work: a millisecond, of which they take a tenth to start
 HASH = c.CFUNCTYPE(c.c_uint64, c.c_char_p, c.c_size_t)
 NAMES = ("XXH3_64bits_dispatch", "XXH3_64bits")  # the first one chooses the best instructions of the processor
 
@@ -37,6 +39,28 @@ def hash_address() -> int | None:
     return None
 
 
+class Parts(NamedTuple):
+    """Parts of an array, by columns. array: contiguous; begin (k,): first byte of each part"""
+
+    array: NDArray[Any]
+    begin: NDArray[np.int64]
+
+    def addresses(self, size: NDArray[np.int64]) -> NDArray[np.uintp]:
+        """Returns the addresses of the parts, of `size` bytes each (k,). Raises ValueError unless all lie inside."""
+        assert self.array.flags.c_contiguous and self.begin.shape == size.shape
+        most = self.array.nbytes
+        inside = (size >= 0) & (size <= most) & (self.begin >= 0) & (self.begin <= most - size)  # no sum may overflow
+        if not inside.all():
+            raise ValueError(f"parts of an array lie outside of its {most} bytes")
+        return (self.array.__array_interface__["data"][0] + self.begin).astype(np.uintp)
+
+    def split(self, size: NDArray[np.int64]) -> list[NDArray[np.uint8]]:
+        """Returns the bytes of each part. Raises as `addresses`."""
+        self.addresses(size)
+        flat = self.array.reshape(-1).view(np.uint8)
+        return [flat[a:b] for a, b in zip(self.begin.tolist(), (self.begin + size).tolist(), strict=True)]
+
+
 class Copies:
     """Copies, or only sums up, arrays of one type, each contiguous.
 
@@ -47,7 +71,7 @@ class Copies:
         self._library = library if hash_address() is not None else None
         if self._library is not None:
             i, p = c.c_int32, c.c_void_p
-            arguments: list[Any] = [c.c_int64, p, p, p, i, i, p, p, p, i]
+            arguments: list[Any] = [c.c_int64, p, p, p, i, i, p, p, p, p, p, p, i]
             self._library.copy_all.restype, self._library.copy_all.argtypes = None, arguments
 
     def copy(
@@ -64,30 +88,93 @@ class Copies:
             made = [copied(s, t.view(s.dtype), s if own_sources else t.view(s.dtype)) for s, t in pairs]
             return [each[0] for each in made], [each[1] for each in made]
         assert all(s.nbytes == t.nbytes for s, t in zip(sources, targets, strict=True))
-        return self._call(sources, _addresses(targets), own_sources)
+        size, item = _sizes(sources)
+        return self._call(_addresses(sources), _addresses(targets), size, item, own_sources)[:2]
+
+    def take(
+        self, sources: Sequence[NDArray[Any]], memory: NDArray[Any], diagonals: Sequence[NDArray[np.int64]]
+    ) -> tuple[list[int], list[bool], list[bool]]:  # fmt: skip
+        """Copies sources one behind the other into memory, of the same type and as many numbers. Returns of each copy
+        its `checksum` and `all_finite`, and whether the numbers on its diagonal are greater than 0.
+
+        sources: may be written to meanwhile; what is returned is about the copies
+        diagonals: places in each source of what are to be positive; those of one array are read once
+        """
+        sizes = [each.size for each in sources]
+        ends = np.cumsum(sizes, dtype=np.int64)
+        assert memory.dtype == sources[0].dtype and ends[-1] == memory.size and memory.flags.c_contiguous
+        if self._library is None:
+            targets = np.split(memory, ends[:-1])
+            sums, finite = self.copy(sources, targets)
+            own = zip(targets, diagonals, strict=True)
+            return sums, finite, [bool((target[places] > 0).all()) for target, places in own]
+        begin = np.array(address(memory) + (ends - sizes) * memory.itemsize, np.uintp)
+        size, item = _sizes(sources)
+        return self._call(_addresses(sources), begin, size, item, False, diagonals)
 
     def sum_up(self, arrays: Sequence[NDArray[Any]]) -> tuple[list[int], list[bool]]:
         """Returns `checksum` and `all_finite` of each array."""
         if self._library is None:
             return [checksum(each) for each in arrays], [all_finite(each) for each in arrays]
-        return self._call(arrays, None, True)
+        size, item = _sizes(arrays)
+        return self._call(_addresses(arrays), None, size, item, True)[:2]
+
+    def copy_parts(
+        self, source: Parts, target: Parts, size: NDArray[np.int64], own_sources: bool = False
+    ) -> list[int]:  # fmt: skip
+        """Copies parts of an array to parts of another one, of `size` bytes each (k,); returns the `checksum` of each.
+        Raises ValueError if a part lies outside of its array.
+
+        own_sources: as of `copy`
+        """
+        begin, to = source.addresses(size), target.addresses(size)
+        if self._library is None:
+            pairs = zip(source.split(size), target.split(size), strict=True)
+            return [copied(s, t, s if own_sources else t)[0] for s, t in pairs]
+        return self._call(begin, to, size, 0, own_sources)[0]
+
+    def sum_parts(self, source: Parts, size: NDArray[np.int64]) -> list[int]:
+        """Returns the `checksum` of parts of an array, of `size` bytes each (k,). Raises as `copy_parts`."""
+        if self._library is None:
+            return [checksum(each) for each in source.split(size)]
+        return self._call(source.addresses(size), None, size, 0, True)[0]
 
     def _call(
-        self, sources: Sequence[NDArray[Any]], targets: NDArray[np.uintp] | None, own_sources: bool
-    ) -> tuple[list[int], list[bool]]:  # fmt: skip
-        assert self._library is not None
-        count, item = len(sources), sources[0].itemsize if sources else 4
-        assert item in (4, 8) and all(each.itemsize == item and each.flags.c_contiguous for each in sources)
-        size = np.array([each.nbytes for each in sources], np.int64)
-        begin = _addresses(sources)
-        sums, finite = np.empty(count, np.uint64), np.empty(count, np.bool_)
-        threads = 1 + min(helping_threads(), count - 1) if int(size.sum()) > ALONE else 1
+        self, begin: NDArray[np.uintp], targets: NDArray[np.uintp] | None, size: NDArray[np.int64], item: int,
+        own_sources: bool, diagonals: Sequence[NDArray[np.int64]] = (),
+    ) -> tuple[list[int], list[bool], list[bool]]:  # fmt: skip
+        """item: bytes of a number; 0: whether all are finite is not looked at, and there are no diagonals."""
+        assert self._library is not None and (item or not diagonals)
+        count, size = len(begin), np.ascontiguousarray(size, np.int64)
+        places = _Places(diagonals) if diagonals else None
+        sums, finite, positive = np.empty(count, np.uint64), np.ones(count, np.bool_), np.ones(count, np.bool_)
+        threads = 1 + min(helping_threads(), count - 1) if int(size.sum()) > SHARED else 1
         self._library.copy_all(
             count, begin.ctypes.data, None if targets is None else targets.ctypes.data, size.ctypes.data, item,
-            own_sources, hash_address(), sums.ctypes.data, finite.ctypes.data, threads,
+            own_sources, hash_address(), sums.ctypes.data, finite.ctypes.data if item else None,
+            places and places.begin.ctypes.data, places and places.count.ctypes.data, positive.ctypes.data, threads,
         )  # fmt: skip
-        return sums.tolist(), finite.tolist()
+        return sums.tolist(), finite.tolist(), positive.tolist()
+
+
+def _sizes(arrays: Sequence[NDArray[Any]]) -> tuple[NDArray[np.int64], int]:
+    """Returns the bytes of each array of one type, each contiguous, and of one of their numbers."""
+    item = arrays[0].itemsize if arrays else 4
+    assert item in (4, 8) and all(each.itemsize == item and each.flags.c_contiguous for each in arrays)
+    return np.array([each.nbytes for each in arrays], np.int64), item
+
+
+class _Places:
+    """Places in arrays, as native code reads them. begin: address of the first in each array. count: of each"""
+
+    def __init__(self, each: Sequence[NDArray[np.int64]]):
+        known = {id(places): places for places in each}
+        self._kept = list(known.values())
+        assert all(places.dtype == np.int64 and places.flags.c_contiguous for places in self._kept)
+        begin = {key: address(places) for key, places in known.items()}
+        self.begin = np.array([begin[id(places)] for places in each], np.uintp)
+        self.count = np.array([len(places) for places in each], np.int64)
 
 
 def _addresses(arrays: Sequence[NDArray[Any]]) -> NDArray[np.uintp]:
-    return np.array([each.__array_interface__["data"][0] for each in arrays], np.uintp)
+    return np.array([address(each) for each in arrays], np.uintp)

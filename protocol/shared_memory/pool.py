@@ -20,6 +20,7 @@ import zenoh
 from numpy.typing import DTypeLike, NDArray
 from zenoh import shm
 
+from protocol.located import Located, address
 from protocol.messages_pb2 import Slot as SlotMessage
 from protocol.shared_memory import limits as shm_limits
 
@@ -53,6 +54,8 @@ class Slot:
         self.capacity = capacity
         self.offset = start + HEADER
         self._bytes = np.frombuffer(memory, np.uint8, capacity + HEADER, start)
+        self._data = self._bytes[HEADER:].view(Located)
+        self._address = address(self._data)
         self._generation = self._bytes[:8].view(np.uint64)
         self.generation = 0
         self.returned = 0  # when it was given back last, counted by the pool
@@ -69,7 +72,10 @@ class Slot:
     def part(self, first: int, dtype: DTypeLike, count: int) -> NDArray[Any]:
         """Returns `count` values from the byte `first` on, in place."""
         kind = np.dtype(dtype)
-        return self._bytes[HEADER + first : HEADER + first + count * kind.itemsize].view(kind)
+        found: Any = self._data[first : first + count * kind.itemsize].view(kind)
+        found.address = self._address + first
+        part: NDArray[Any] = found
+        return part
 
     def message(self) -> SlotMessage:
         """Describes the slot for a borrower on this host."""
@@ -239,7 +245,7 @@ class SlotPool:
             return None
         try:
             slot = Slot(capacity)
-        except SlotsUnusable:
+        except (SlotsUnusable, OSError):
             if not self._live:
                 raise
             return None

@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
+from functools import partial
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -18,3 +20,13 @@ def create(device: str, precision: str) -> Backend:
     from sim_server.backends.cpu.device import Cpu
 
     return Cpu()
+
+
+def bytes_of_copies(device: str, precision: str) -> Callable[[Sequence[float]], float] | None:
+    """Returns what tells the bytes of the host that the loop keeps for copies of matrices, from the 3x3 blocks of each;
+    None: it keeps none."""
+    if device != "gpu":
+        return None
+    from sim_server.backends.gpu.loop import bytes_of_copies as told
+
+    return partial(told, real="float32" if precision == "float32" else "float64")

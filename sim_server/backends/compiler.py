@@ -202,9 +202,12 @@ def build_id() -> str:
     return f"{name}:{made}" if (name := variant()) else made
 
 
-def native(path: str, signatures: dict[str, tuple[Any, list[Any]]], stepping: bool = True) -> ctypes.CDLL:
-    """A host-only C++ text of this package with its functions' types declared."""
-    library = ctypes.CDLL(str(build(SOURCES / path, stepping=stepping)))
+def native(
+    path: str, signatures: dict[str, tuple[Any, list[Any]]], stepping: bool = True, lock: bool = False
+) -> ctypes.CDLL:
+    """A host-only C++ text of this package with its functions' types declared. lock: they keep Python's lock, as is
+    best where that takes less time than to get it back while other threads are at work."""
+    library = (ctypes.PyDLL if lock else ctypes.CDLL)(str(build(SOURCES / path, stepping=stepping)))
     for name, (result, arguments) in signatures.items():
         function: Callable[..., Any] = getattr(library, name)
         function.restype, function.argtypes = result, arguments  # type: ignore[attr-defined]

@@ -6,6 +6,8 @@ from dataclasses import dataclass
 from sim_server.arrays import Float64, Int32
 from sim_server.backends.ties import Ties
 
+MOST_MODES = 600  # of the coarse space of an island of bodies
+
 
 @dataclass(frozen=True)
 class Obstacles:

@@ -2,6 +2,7 @@
 """Several jobs in one message: their matrices one after another in one slot, and rooms for their factors in another."""
 
 from collections.abc import Sequence
+from functools import cache
 from itertools import chain
 from typing import NamedTuple
 
@@ -32,9 +33,9 @@ class Entry(NamedTuple):
 
 def entries_of(jobs: Sequence[tuple[Job, AnnouncedObject]]) -> list[Entry]:
     """Lays out the rooms of factors that are as large as the largest so far."""
-    made, first = [], 0
+    made, first, bytes_of = [], 0, cache(lambda dtype: np.dtype(dtype).itemsize)
     for job, known in jobs:
-        size = known.most_values(job.method.name) * np.dtype(job.dtype).itemsize
+        size = known.most_values(job.method.name) * bytes_of(job.dtype)
         room = -(-size // ROOM_ALIGNMENT) * ROOM_ALIGNMENT
         made.append(Entry(job, known, room, first))
         first += room

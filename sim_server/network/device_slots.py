@@ -6,6 +6,7 @@ The server owns every slot, so a worker that dies takes none away. What a worker
 looked at (`SharedMemory.take`).
 """
 
+import logging
 import secrets
 from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -19,6 +20,8 @@ from protocol.messages_pb2 import Echo, Header
 from protocol.shared_memory.device_probe import DEVICE_HEADER, NUMBER
 from protocol.shared_memory.probe import LANES, NUMBERS
 from sim_server.backends.shared_memory import SharedMemory
+
+log = logging.getLogger(__name__)
 
 UNIT = 2 << 20  # bytes; allocations are multiples: a driver shares whole pages of this size
 
@@ -47,6 +50,7 @@ class DeviceSlots:
         self._making: dict[Future[DeviceSlot | None], int] = {}  # with their capacities
         self._slots: list[DeviceSlot] = []
         self._lent: set[int] = set()  # ids
+        self._told = False  # of an error of the driver
         self._probe = self._made(UNIT)
         if self._probe is not None:
             self.mark(self._probe, self._probe.generation)
@@ -116,7 +120,14 @@ class DeviceSlots:
     def _take_made(self) -> None:
         for future in [each for each in self._making if each.done()]:
             del self._making[future]
-            if (slot := future.result()) is not None:
+            try:
+                slot = future.result()
+            except Exception as error:  # of the driver; what would be there travels through shared memory
+                if not self._told:
+                    log.warning("device memory for matrices and factors is not there: %s (told once)", error)
+                self._told = True
+                continue
+            if slot is not None:
                 self._slots.append(slot)
 
     def _made(self, whole: int) -> DeviceSlot | None:

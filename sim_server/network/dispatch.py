@@ -122,9 +122,8 @@ class Dispatch(FactorSource):
 
     def epoch(self, name: str) -> int | None:
         """Returns the epoch of an object that was announced last; jobs of others are refused."""
-        with self._lock:
-            known = self.decoder.objects.get(name)
-            return None if known is None else known.epoch
+        known = self.decoder.objects.get(name)  # without the lock: it is asked of each factor
+        return None if known is None else known.epoch
 
     def workers(self) -> list[WorkerInfo]:
         """Returns the last heartbeats of the workers that may be given jobs."""
@@ -249,6 +248,8 @@ class Dispatch(FactorSource):
                 self._on_message[channel](sample)
             except Refused as refusal:
                 self._counters.refuse(refusal)
+            except Exception as error:  # whatever a message holds, the run goes on
+                self._counters.refuse(self._counters.unexpected(error, f"a message {str(sample.key_expr)[:200]!r}"))
         self._intake.take_decoded()
         self._sender.give_back_sent()
         self._query_tokens()

@@ -4,14 +4,14 @@
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from functools import cache
 from weakref import WeakValueDictionary
 
 import numpy as np
-from numpy.typing import NDArray
 
 from protocol.channels import CHANNELS, MOST_JOBS, name_in
 from protocol.factor import Factor, FactorPattern, check_values
+from protocol.located import rows
 from protocol.messages_pb2 import DeviceSlot as DeviceSlotMessage
 from protocol.messages_pb2 import Factor as FactorMessage
 from protocol.messages_pb2 import FactorBatch, Topology
@@ -35,9 +35,12 @@ from sim_server.arrays import Float32, Float64
 from sim_server.backends.shared_memory import SharedMemory
 from sim_server.network.leases import InFlightJob
 from sim_server.network.native_copies import native_copies
+from sim_server.scene.size_limits import expected_values
 from sim_server.updates.factor_source import FactorMemory
 
 LARGE = 1 << 20  # bytes of a factor for which `memory` is asked
+WORST_FILL = 6  # over that of nested dissection; minimum degree orderings leave about twice as much
+ALWAYS_ALLOWED = 1 << 18  # values, a megabyte: a small matrix may well have a dense factor
 MAX_PATTERNS = 4  # kept per object: one for each library among its workers
 
 
@@ -78,6 +81,11 @@ class AnnouncedObject:
     def pattern(self, id: int) -> FactorPattern | None:
         """Returns a pattern that a worker has sent for this object, or that a factor of one like it had."""
         return self.patterns.get(id) or self.complete.patterns.get(id)
+
+    @property
+    def most_allowed(self) -> int:
+        """Most values of a pattern: slots for factors of this object and those like it have room for the largest."""
+        return max(ALWAYS_ALLOWED, int(WORST_FILL * expected_values(self.size // 3, self.blocks)))
 
     @property
     def known_patterns(self) -> list[int]:
@@ -145,6 +153,12 @@ class FactorDecoder:
         pattern = FactorPattern.from_message(message)
         if pattern.id in known.patterns:
             return None
+        if pattern.nonzeros > (most := known.most_allowed):
+            raise Refused(
+                f"FactorPattern.nonzeros is {pattern.nonzeros}; allowed for the {known.blocks} blocks of the matrix: "
+                f"at most {most}, {WORST_FILL} times what nested dissection leaves",
+                "size",
+            )
         while len(known.patterns) >= MAX_PATTERNS:
             known.patterns.pop(next(iter(known.patterns)))
         known.patterns[pattern.id] = pattern
@@ -228,12 +242,14 @@ class FactorDecoder:
                 made[k] = refusal
         if not found:
             return made
-        values = self._copied([(job, pattern.nonzeros) for _, _, job, _, pattern in found])
-        positive = _positive(values, [pattern for *_, pattern in found])
-        for (k, place, job, known, pattern), (each, checked, finite), good in zip(found, values, positive, strict=True):
-            told = columns.checksums[place], job, columns.seconds[place], columns.remedies[place]
+        values, sums, finite, positive = self._taken([(job, pattern) for _, _, job, _, pattern in found])
+        looked = zip(found, values, sums, finite, positive, strict=True)
+        for (k, place, job, known, pattern), own, hashed, is_finite, is_positive in looked:
+            told, remedy = columns.checksums[place], columns.remedies[place]
             try:
-                made[k] = self._factor(known, pattern, each, *told, (checked, finite), good)
+                if hashed != told or not (is_finite and is_positive):
+                    check_values(own, pattern, told, (hashed, is_finite), is_positive)
+                made[k] = self._made(known, pattern, own, job, columns.seconds[place], remedy)
             except Refused as refusal:
                 made[k] = refusal
         return made
@@ -254,26 +270,29 @@ class FactorDecoder:
         _check_slot(columns.slot, nonzeros, job)
         return known, pattern
 
-    def _copied(self, found: Sequence[tuple[InFlightJob, int]]) -> list[tuple[Float32 | Float64, int, bool]]:
-        """Copies numbers of values out of the slots allocated for jobs, which are of one type: they must not change any
-        more once they are checked. Returns them, their checksum, and whether all are finite, of each."""
+    def _taken(
+        self, found: Sequence[tuple[InFlightJob, FactorPattern]]
+    ) -> tuple[list[Float32 | Float64], list[int], list[bool], list[bool]]:  # fmt: skip
+        """Copies values of factors out of the slots allocated for jobs, which are of one type: they must not change any
+        more once they are checked. Returns them, and of each its checksum, whether all values are finite, and whether
+        the diagonal is positive."""
         dtype = np.dtype(found[0][0].dtype)
-        ends = np.cumsum([count for _, count in found])
-        total = int(ends[-1])
+        counts = [pattern.nonzeros for _, pattern in found]
+        total = sum(counts)
         if total * dtype.itemsize > LARGE:
             memory = self.memory(1 << (total - 1).bit_length(), dtype)  # of few sizes, so that it is used again
         else:
             memory = np.empty(total, dtype)
-        values = np.split(memory[:total], ends[:-1])
-        sources = [_slot(job).part(job.first, dtype, count) for job, count in found]
-        return list(zip(values, *native_copies().copy(sources, values), strict=True))
+        memory = memory[:total]
+        sources = [_slot(job).part(job.first, dtype, count) for (job, _), count in zip(found, counts, strict=True)]
+        looked = native_copies().take(sources, memory, [pattern.diagonal for _, pattern in found])
+        return rows(memory, counts), *looked
 
     def _factor(
         self, known: AnnouncedObject, pattern: FactorPattern, values: Float32 | Float64, checksum: int | None,
         job: InFlightJob, seconds: float, remedy: str, seen: tuple[int, bool] | None = None,
-        positive: bool | None = None,
     ) -> Factor:  # fmt: skip
-        check_values(values, pattern, checksum, seen, positive)
+        check_values(values, pattern, checksum, seen)
         return self._made(known, pattern, values, job, seconds, remedy)
 
     def _made(
@@ -359,6 +378,11 @@ def _slot(job: InFlightJob) -> Slot:
     return job.factor_slot
 
 
+@cache
+def _item_bytes(dtype: str) -> int:
+    return np.dtype(dtype).itemsize
+
+
 def _check_slot(given: tuple[str, int, int], nonzeros: int, job: InFlightJob) -> int:
     """Returns the bytes of a factor that fits into the slot allocated for its job, and is said to be there."""
     slot = job.factor_slot
@@ -367,23 +391,10 @@ def _check_slot(given: tuple[str, int, int], nonzeros: int, job: InFlightJob) ->
     allocated = (slot.segment, slot.offset, job.factor_generation)
     if given != allocated:
         raise Refused(f"Factor.slot is {given}; allowed: {allocated}, as lent for this job", "slot")
-    size, room = nonzeros * np.dtype(job.dtype).itemsize, job.room or slot.capacity
+    size, room = nonzeros * _item_bytes(job.dtype), job.room or slot.capacity
     if size > room:
         raise Refused(f"Factor.nonzeros is {nonzeros}: {size} bytes in a slot of {room}", "slot")
     return size
-
-
-def _positive(
-    values: Sequence[tuple[Float32 | Float64, int, bool]], patterns: Sequence[FactorPattern]
-) -> list[bool]:  # fmt: skip
-    """Returns whether the diagonal of each L is positive; values: one after another in one array."""
-    first, count = values[0][0], patterns[0].nonzeros
-    if any(pattern is not patterns[0] for pattern in patterns):
-        return [bool((each[0][p.diagonal] > 0).all()) for each, p in zip(values, patterns, strict=True)]
-    strides = first.nbytes, first.itemsize
-    every: NDArray[Any] = np.lib.stride_tricks.as_strided(first, (len(values), count), strides)
-    good: list[bool] = np.all(every[:, patterns[0].diagonal] > 0, axis=1).tolist()
-    return good
 
 
 def _from_payload(message: FactorMessage, payload: Sized) -> Float32 | Float64:

@@ -117,6 +117,9 @@ class FactorFetch:
         except Refused as refusal:
             self._counters.refuse(refusal)
             return False
+        except Exception as error:  # anybody may answer: the right answer may still come
+            self._counters.refuse(self._counters.unexpected(error, f"a part of a factor of {self.job.object}"))
+            return False
         self._came = time.monotonic()
         return True
 

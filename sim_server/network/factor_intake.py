@@ -22,6 +22,7 @@ from sim_server.network.leases import InFlightJob
 T = TypeVar("T")
 
 LARGE = 4 << 20  # bytes of a factor whose copy and checks take more than a few milliseconds
+LARGE_MESSAGE = 1 << 19  # bytes of the factors of a message, for which it takes a tenth of one: it comes often
 FETCHES = 2  # factors that arrive in parts at a time, each in memory of its own
 Results = list[Factor | Refused]
 """Of decoding the factors of a message: each, or why it is refused."""
@@ -71,6 +72,7 @@ class FactorIntake:
         self._session, self._server, self._incarnation = session, server, incarnation
         self._pool, self._counters, self._book = pool, counters, book
         self._thread = ThreadPoolExecutor(1, "large factors")
+        self._messages = ThreadPoolExecutor(1, "factors of messages")  # small ones, which wait for no large one
         self._fetching = ThreadPoolExecutor(FETCHES, "parts of factors")
         self.factors: list[Factor] = []
         self._decoding: dict[int, Decoding] = {}  # beside the caller, by number of the job
@@ -110,7 +112,7 @@ class FactorIntake:
             return self._book.leases.finish(job, None if message.failure else message.seconds)
         if message.parts and not message.failure:
             return self._fetch(message, job)
-        decode = partial(self._book.decoder.decode, message, sample.payload, job)
+        decode = partial(self._decoded, job, partial(self._book.decoder.decode, message, sample.payload, job))
         on_device = message.HasField("device_slot")
         if not message.failure and (on_device or 4 * message.nonzeros > LARGE):  # copied and checked beside the caller
             self._refuse_second(job)
@@ -138,10 +140,10 @@ class FactorIntake:
                 good.append((place, job))
         seconds = [message.seconds[place] for place, _ in good]
         together = DecodedTogether([job for _, job in good], seconds, message.matrix_shared, duration)
-        decode = partial(self._book.decoder.decode_several, message, good)
-        if 4 * sum(message.nonzeros) <= LARGE:
+        decode = partial(self._all_decoded, message, good)
+        if 4 * sum(message.nonzeros) <= LARGE_MESSAGE:
             return self._take_together(together, decode())
-        self._together.append((together, self._woken(self._thread.submit(decode))))
+        self._together.append((together, self._woken(self._messages.submit(decode))))
         self._beside.update(job.number for job in together.jobs)
 
     def _matched(self, message: FactorBatch) -> dict[int, tuple[int, InFlightJob]]:
@@ -156,6 +158,26 @@ class FactorIntake:
             except Refused as refusal:
                 self._counters.refuse(refusal)
         return found
+
+    def _decoded(self, job: InFlightJob, decode: Callable[[], Factor]) -> Factor:
+        """Returns the factor that `decode` returns. Whatever error it raises, the factor is refused and the run goes
+        on. From any thread."""
+        try:
+            return decode()
+        except Refused:
+            raise
+        except Exception as error:
+            raise self._counters.unexpected(error, f"factor of {job.object} by worker {job.worker}") from error
+
+    def _all_decoded(self, message: FactorBatch, answers: Sequence[tuple[int, InFlightJob]]) -> Results:
+        """Returns what FactorDecoder.decode_several does, likewise."""
+        try:
+            return list(self._book.decoder.decode_several(message, answers))
+        except Exception as error:
+            first, *others = [job.object for _, job in answers]
+            and_more = f" and {len(others)} more" if others else ""
+            refusal = self._counters.unexpected(error, f"factors of {first}{and_more} by worker {message.worker}")
+            return [refusal for _ in answers]
 
     def _woken(self, future: Future[T]) -> Future[T]:
         """Has who takes in factors woken at the end of a decoding."""
@@ -179,7 +201,7 @@ class FactorIntake:
             self._session, self._server, self._incarnation, self._counters, job, message.nonzeros, message.parts,
             self._slots_for_parts(job),
         )  # fmt: skip
-        decode = partial(self._book.decoder.decode, message, b"", job, fetch.run)
+        decode = partial(self._decoded, job, partial(self._book.decoder.decode, message, b"", job, fetch.run))
         future, by_slot = self._woken(self._fetching.submit(decode)), _slots_used(message, fetch)
         self._decoding[job.number] = Decoding(job, future, future.result, message.seconds, by_slot, fetch=fetch)
         self._fetches.add(job.number)

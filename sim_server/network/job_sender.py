@@ -22,6 +22,7 @@ from sim_server.backends.shared_memory import PlacedMatrix
 from sim_server.network.batch_message import MOST_TOGETHER, Entry, batch_message, entries_of, fill, group
 from sim_server.network.bookkeeping import Bookkeeping
 from sim_server.network.device_slots import DeviceSlot, DeviceSlots
+from sim_server.network.factor_decoder import AnnouncedObject
 from sim_server.network.job_message import add_values, matrix_message
 from sim_server.network.leases import InFlightJob
 from sim_server.network.send_queue import SendQueue
@@ -108,17 +109,25 @@ class JobSender:
         batches: dict[tuple[str, tuple[str, Method]], list[int]] = {}  # places of jobs by worker and what they share
         rooms = self._choice.rooms() if len(jobs) > 1 else {}
         able = {name for name in rooms if self._choice.takes_batches(name)}
+        idle = [name for name, room in rooms.items() if room > 0]
+        failing = bool(self._book.reliability.failing_objects)
+        last: tuple[str, str, Method] | None = None  # worker, dtype and method of the job before, by identity
         for place, job in enumerate(jobs):
-            idle = [name for name, room in rooms.items() if room > 0]
-            worker = self._worker_for(job, idle, rooms) if idle else None
-            if worker is None or worker not in able or not self._fits_batch(job):
+            known = self._check(job)
+            worker = self._worker_for(job, idle, rooms, failing) if idle else None
+            if worker is None or worker not in able or not self._fits_batch(job, known):
                 taken[place] = self.submit(job)
                 rooms = self._choice.rooms()
                 for (name, _), places in batches.items():
                     rooms[name] = rooms.get(name, 0) - len(places)
-            else:
-                rooms[worker] -= 1
-                batches.setdefault((worker, group(job)), []).append(place)
+                idle = [name for name, room in rooms.items() if room > 0]
+                continue
+            rooms[worker] -= 1
+            if not rooms[worker]:
+                idle.remove(worker)
+            if last is None or last[0] != worker or last[1] != job.dtype or last[2] is not job.method:
+                last, own = (worker, job.dtype, job.method), batches.setdefault((worker, group(job)), [])
+            own.append(place)
         for (worker, _), places in batches.items():
             for k in range(0, len(places), MOST_TOGETHER):
                 part = places[k : k + MOST_TOGETHER]
@@ -126,28 +135,30 @@ class JobSender:
                     taken[place] = sent
         return taken
 
-    def _check(self, job: Job) -> None:
-        known = self._book.decoder.objects.get(job.object)
+    def _check(self, job: Job) -> AnnouncedObject:
+        """Returns what is known of the object of a job. Raises ValueError for one that is not of its epoch or shape."""
+        known, values = self._book.decoder.objects.get(job.object), job.values
         if known is None or known.epoch != job.epoch:
             raise ValueError(f"job for {job.object} epoch {job.epoch}, which was not announced")
-        shape = (known.size // 3, 3) if job.positions else (known.blocks, 3, 3)
-        if job.values.shape != shape or job.values.dtype != np.float64:
-            raise ValueError(f"job for {job.object}: values {job.values.shape}, allowed: float64 {shape}")
+        shape = (known.size // 3, 3) if values.ndim == 2 else (known.blocks, 3, 3)
+        if values.shape != shape or values.dtype != np.float64:
+            raise ValueError(f"job for {job.object}: values {values.shape}, allowed: float64 {shape}")
+        return known
 
-    def _worker_for(self, job: Job, idle: list[str], rooms: Mapping[str, int]) -> str | None:
-        """Chooses a worker of those with room; None if there is none or the object has a job in flight."""
-        self._check(job)
+    def _worker_for(self, job: Job, idle: list[str], rooms: Mapping[str, int], failing: bool) -> str | None:
+        """Chooses a worker of those with room; None if there is none or the object has a job in flight. failing: of
+        any object jobs failed"""
         if job.object in self._book.leases.by_object:
             return None
-        able = [name for name in idle if not job.positions or self._choice.assembles(name)]
-        if self._book.reliability.failing_objects:
+        able = [name for name in idle if self._choice.assembles(name)] if job.positions else idle
+        if failing:
             able = self._choice.candidates(able, job.object)
         return self._choice.choose(able, job.object, rooms) if able else None
 
-    def _fits_batch(self, job: Job) -> bool:
+    def _fits_batch(self, job: Job, known: AnnouncedObject) -> bool:
         """True if the size of the factor is known: that of an incomplete one may grow."""
-        sized = self._book.decoder.objects[job.object].most_values(job.method.name) > 0
-        return not job.positions and sized and job.method.name != "incomplete_cholesky"
+        method = job.method.name
+        return job.values.ndim == 3 and method != "incomplete_cholesky" and known.most_values(method) > 0
 
     # ---- a batch ---------------------------------------------------------------------------------------------
 
@@ -294,16 +305,16 @@ class JobSender:
         now, leases, objects = self._book.clock(), self._book.leases, self._book.decoder.objects
         latest, generation = leases.deadlines().get(worker, 0.0), factor_slot.generation if factor_slot else 0
         begun: list[InFlightJob] = []
+        device_generation = device_slot.generation if device_slot else 0
         for job, lease, (first, room) in zip(jobs, seconds, rooms, strict=True):
-            deadline = now + max(lease, min(latest - now, BEHIND))
+            name, deadline = job.object, now + max(lease, min(latest - now, BEHIND))
             latest = max(latest, deadline)
+            exclusive = now + leases.exclusive_period(name, objects[name].blocks)
             begun.append(
                 InFlightJob(
-                    leases.next_number(), job.object, job.epoch, job.step, job.warp, _dtype_name(job.dtype), worker,
-                    deadline, factor_slot, generation, slots, first, room, now,
-                    now + leases.exclusive_period(job.object, objects[job.object].blocks), job.method.name,
-                    payload_bytes, job.positions, PART_BYTES, device_slot,
-                    device_slot.generation if device_slot else 0,
+                    leases.next_number(), name, job.epoch, job.step, job.warp, _dtype_name(job.dtype), worker, deadline,
+                    factor_slot, generation, slots, first, room, now, exclusive, job.method.name, payload_bytes,
+                    job.values.ndim == 2, PART_BYTES, device_slot, device_generation,
                 )
             )  # fmt: skip
         leases.start_all(begun)

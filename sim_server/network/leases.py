@@ -7,6 +7,7 @@ Pure bookkeeping, without network or clock.
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from operator import attrgetter
 from typing import Protocol
 
 from protocol.refused import Refused
@@ -24,6 +25,9 @@ DELIVERY = 1.0  # s in which a job that was sent reaches its worker, without the
 BUFFERED = 1 << 22  # bytes that may still be under way when a job was sent
 MIN_BANDWIDTH = 1e6  # bytes/s of the slowest link
 MAX_EXPIRED = 2  # expired jobs with which a worker still gets slots of shared memory
+
+
+NUMBER, DEADLINE, SLOTS = attrgetter("number"), attrgetter("deadline"), attrgetter("slots")  # of jobs
 
 
 class SlotAllocator(Protocol):
@@ -143,7 +147,7 @@ class Leases:
         jobs = self.by_worker.get(worker, {})
         for job in dropped:
             jobs.pop(job.number, None)
-        latest = max(job.deadline for job in dropped)
+        latest = max(map(DEADLINE, dropped))
         if self._deadlines is not None and latest >= self._deadlines.get(worker, latest):
             self._deadlines = None  # the latest one may be another now
         if not jobs:
@@ -216,9 +220,9 @@ class Leases:
             if self.by_object.get(job.object) is job:
                 del self.by_object[job.object]
         self._drop(jobs)
-        self._reassigned.difference_update(job.number for job in jobs)
+        self._reassigned.difference_update(map(NUMBER, jobs))
         self._free_slots(jobs)
-        self._free_expired(jobs[0].worker, max(job.number for job in jobs))
+        self._free_expired(jobs[0].worker, max(map(NUMBER, jobs)))
 
     def _remember(self, job: InFlightJob, seconds: float) -> None:
         """Takes note of how long a factorization took, by which later leases go."""
@@ -315,5 +319,6 @@ class Leases:
 
     def _free_slots(self, jobs: Sequence[InFlightJob]) -> None:
         if self._allocator is not None:
-            for slot, users in Counter(slot for job in jobs for slot in job.slots).items():
-                self._allocator.give_back(slot, users)
+            for slots, users in Counter(map(SLOTS, jobs)).items():  # those of a batch have the same
+                for slot in slots:
+                    self._allocator.give_back(slot, users)

@@ -171,6 +171,8 @@ class Queryables:
                 received.append((command, query))
             except Refused as refusal:
                 self._refuse(refusal, query)
+            except Exception as error:  # the others of this moment are carried out all the same
+                self._refuse(self._counters.unexpected(error, "a Command"), query)
         found = coalesce_moves(received, self._check)
         for reason, query in found.refused:
             self._refuse(reason, query)
@@ -192,6 +194,14 @@ class Queryables:
             raise Refused(f"a Command, {said}, came under the key {asked[:200]}; allowed: its own", "key")
 
     def _check(self, command: Command) -> None:
+        try:
+            self._check_all(command)
+        except Refused:
+            raise
+        except Exception as error:
+            raise self._counters.unexpected(error, "a Command") from error
+
+    def _check_all(self, command: Command) -> None:
         check_header(command, incarnation=self._incarnation if command.header.incarnation else None)
         check_name(command.client, "Command.client")
         check_strings(command)

@@ -25,9 +25,7 @@ class WorkerChoice:
 
     def open(self) -> list[str]:
         """Available workers with room for a job."""
-        available, now = self._book.available(), self._book.clock()
-        free = [name for name in available if self.room(name) > 0]
-        return [name for name in free if self._book.reliability.may_get_job(name, available, now)]
+        return list(self.rooms())
 
     def room(self, worker: str) -> int:
         """Number of jobs that a worker can take beside those it has.
@@ -52,7 +50,10 @@ class WorkerChoice:
 
     def rooms(self) -> dict[str, int]:
         """Room of each open worker."""
-        return {name: self.room(name) for name in self.open()}
+        available, now = self._book.available(), self._book.clock()
+        free = {name: room for name in available if (room := self.room(name)) > 0}
+        may_get_job = self._book.reliability.may_get_job
+        return {name: room for name, room in free.items() if may_get_job(name, available, now)}
 
     def _waiting(self, worker: str) -> int:
         """Number of jobs that a worker has not done yet; those whose parts are fetched are done."""

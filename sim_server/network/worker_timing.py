@@ -92,9 +92,9 @@ class WorkerTiming:
         busy = list(busy)
         if not busy:
             return 0
-        known = [min(times.values()) for times in self._seconds.values() if times]
         own, since = min(((self.slowness(worker), -since) for worker, since in idle), default=(0.0, 0.0))
-        if not own or not known:
+        known = [min(times.values()) for times in self._seconds.values() if times] if own else []
+        if not known:
             return 0
         usual = sum(known) / len(known)
         if -since > own * usual:

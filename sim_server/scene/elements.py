@@ -45,11 +45,11 @@ def element_errors(objects: Sequence[HasElements], integrator: IntegratorOptions
             yield InitErrorDetails(type=complaint(message), loc=("object", index, "elements"), input=o.elements)
 
 
-def kind_of_elements(o: HasElements, mesh: Mesh, integrator: IntegratorOptions) -> Kind:
-    """Returns the kind that an object with this mesh has."""
+def kind_of_elements(o: HasElements, mesh: Mesh | None, integrator: IntegratorOptions) -> Kind:
+    """Returns the kind that an object with this mesh has. None: a bar, whose nodes are corners"""
     if o.elements != "auto":
         return o.elements
-    others: Kind = "smoothed" if mesh.quadratic is None else "quadratic"
+    others: Kind = "smoothed" if mesh is None or mesh.quadratic is None else "quadratic"
     return "linear" if _reason(others, o.effects, integrator) else others
 
 

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Carries out commands of clients on a running simulation: to push, grab, set, pause, step, reset, save and so on."""
 
+import logging
 import math
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
@@ -18,9 +19,11 @@ if TYPE_CHECKING:
     from sim_server.effects.touch import Interaction, Touch  # imported where a scene lists it
     from sim_server.service.supervisor import Supervisor
 
+log = logging.getLogger(__name__)
 
 MOST_LISTED = 2000  # live parameters in a reply
 MOST_SET, LONGEST_KEY, LONGEST_VALUE = 256, 300, 8192  # parameters of a command; characters
+FAILED = "it failed"  # begins the reply to a command that ended in an error which no check foresees
 MAX_STEPS = 1_000_000  # single ones of a command
 UNIT = 1e-6  # that the length of a quaternion may differ from 1 by
 
@@ -73,6 +76,9 @@ class Commands:
             return verb(self, command)
         except ValueError as error:  # BadCommand, BadParameter, TouchError, MoveError and WorkerError
             return pb.Reply(error=str(error))
+        except Exception as error:  # whatever a client asks for, the run goes on
+            log.exception("command %s of %s failed", command.verb, command.client)
+            return pb.Reply(error=f"{FAILED}: {type(error).__name__}: {error}")
 
     def together(self) -> AbstractContextManager[None]:
         """Returns a context for the commands of a round: the loop gets their changes together when it ends."""

@@ -12,12 +12,12 @@ from protocol.method import Method
 from sim_server.backends.rosenbrock import FORMS
 from sim_server.mechanics.world import Body
 from sim_server.updates.autotune.preconditioner import PreconditionerTuner
-from sim_server.updates.stats import MEMORY, RunningMean, flops, updated
-from sim_server.updates.update_table import NONE, Cell, MeanCell, UpdateTable
+from sim_server.updates.stats import RunningMean, flops
+from sim_server.updates.update_table import NONE, TEXT, Cell, MeanCell, UpdateTable
 
 MAX_REMEMBERED = 32  # factors whose method and worker are remembered
 ONE_SOLVE, FACTOR = FORMS["ONE_SOLVE"], FORMS["FACTOR"]
-STAGES = 2  # linear solves of a step of the other forms
+STAGES: int = TEXT.constant("STAGES")  # linear solves of a step of the other forms
 MIN_SECONDS = 1e-6  # s; a factorization is never taken to be faster
 
 
@@ -67,7 +67,7 @@ class SolveStatistics:
 class JobState:
     """The matrix that is being copied or factorized.
 
-    copy: into which the loop copies the matrix or the positions requested
+    copy: into which the loop copies the matrix or the positions requested (`set_copy`)
     request: number of the request for that copy, among those of all bodies; requested: when it was [s, monotonic]
     extrapolated: by how much the positions requested were extrapolated [s]
     sent: step of the last matrix that was sent; None: none was
@@ -81,22 +81,18 @@ class JobState:
 
     def __init__(self, table: UpdateTable, index: int):
         self._table, self._index = table, index
-        self._copy: NDArray[np.float64] | None = None
+        self.copy: NDArray[np.float64] | None = None
         self.request, self.requested, self.extrapolated = 0, 0.0, 0.0
         self.matrix: tuple[int, NDArray[np.float64]] | None = None
         self.positions = False
 
-    @property
-    def copy(self) -> NDArray[np.float64] | None:
-        return self._copy
-
-    @copy.setter
-    def copy(self, copy: NDArray[np.float64] | None) -> None:
-        self._copy, self._table.copying[self._index] = copy, copy is not None
+    def set_copy(self, copy: NDArray[np.float64] | None) -> None:
+        """Takes note of the memory that the loop is asked to copy into; None: the copy is given up."""
+        self.copy, self._table.copying[self._index] = copy, copy is not None
 
     def on_sent(self, step: int) -> None:
         """Takes note that the copy was sent, but for what stands in the table."""
-        copy, self._copy = self._copy, None
+        copy, self.copy = self.copy, None
         self.matrix = None if copy is None else (step, copy)
         self.positions = copy is not None and copy.ndim == 2
 
@@ -187,7 +183,9 @@ class FactorStatistics:
     def note(self, factor: Factor, cost: float) -> None:
         """Remembers of a factor what stands in no table."""
         if method := self.method(factor.step):
-            self.cost_by_method.setdefault(method.name, RunningMean()).add(cost)
+            if (mean := self.cost_by_method.get(method.name)) is None:
+                mean = self.cost_by_method[method.name] = RunningMean()
+            mean.add(cost)
         _remember(self.workers, factor.step, factor.worker)
         self.regularized += bool(factor.remedy)
 
@@ -231,9 +229,7 @@ class BodyUpdateState:
     def on_check(self, step: int) -> None:
         """Takes note that the factor of `step` has come and is checked beside the steps: the next matrix may be sent
         meanwhile."""
-        self.job.checked = step
-        if step == self.job.sent:
-            self.job.in_flight = False
+        on_checks(self._table, [self], [step])
 
     def on_factor(self, factor: Factor, step: int) -> bool:
         """Takes note of a factor that came during `step`; False if a newer one is there already."""
@@ -307,68 +303,18 @@ class BodyUpdateState:
             self.solves.max_factor_age = max(self.solves.max_factor_age, int(record["step"]) - 1 - factor_step)
 
 
-def excess(records: Any, floor: int, error_bound: Any) -> Any:
-    """Returns what steps add to the sum by which their objects are ranked for a factor (scheduler.py).
-
-    Of a step that iterates: its iterations above `floor` in each solve. Of a step by the factor alone: the estimate of
-    its error over the bound [m], since it has no iterations, and a factor that ages costs accuracy instead.
-    records: of the loop, of any shape that error_bound is broadcast to
-    """
-    form = records["form"]
-    stages = np.where(form == ONE_SOLVE, 1, STAGES)
-    above = np.maximum(records["iterations"] - floor * stages * np.maximum(records["linearizations"], 1), 0.0)
-    alone = form == FACTOR
-    if not alone.any():  # of a thousand bodies each operation counts
-        return above
-    return np.where(alone, np.where(alone, records["estimate"], 0.0) / error_bound, above)
-
-
-def observe_steps(table: UpdateTable, r: NDArray[Any], floor: int) -> None:
-    """Takes note of whole steps, as BodyUpdateState.observe does of each record of (steps, bodies), in seconds.
-
-    table: that of the bodies
-    """
-    steps, factor = len(r), r["factor_step"]
-    above = excess(r, floor, table.error_bound)
-    weights = (1 - MEMORY) ** np.arange(steps - 1, -1, -1)
-    each = r["solve"] / (r["iterations"] + 1)
-    costs = each[0] if steps == 1 else weights @ each / weights.sum()
-    before = np.where(np.isnan(table.iteration_cost), each[0], table.iteration_cost)
-    table.iteration_cost[:] = costs + (1 - MEMORY) ** steps * (before - costs)
-    table.refused += r["fallbacks"].sum(axis=0)
-    age = np.where(factor >= 0, r["step"] - 1 - factor, NONE).max(axis=0)
-    np.maximum(table.max_factor_age, age, out=table.max_factor_age)
-    made, one = factor[0], (factor == factor[0]).all(axis=0)
-    same = one & ((made < 0) | ((made == table.factor_step) & (made == table.newest)))
-    total = np.where(same, above.sum(axis=0), 0.0)
-    table.excess += total
-    table.lost += np.where(made >= 0, total, 0.0)
-    table.latest[same] = above[-1, same]
-    outdated = one & (made >= 0) & (made < table.newest)  # a newer factor was taken up: these solves count no more
-    changed = np.flatnonzero(~same & ~outdated)
-    if len(changed):
-        _add_changed(table, changed, above[:, changed], factor[:, changed])
-
-
-def _add_changed(table: UpdateTable, row: NDArray[np.int64], above: Any, factor: Any) -> None:
-    """Adds steps (steps, rows) within which factors changed, as SolveStatistics.add does of each body."""
-    total, latest, lost, last = (c[row] for c in (table.excess, table.latest, table.lost, table.factor_step))
-    for each, made in zip(above, factor, strict=True):
-        counted = (made < 0) | (made >= table.newest[row])
-        new = counted & (made >= 0) & (made != last)
-        _add(table.first_excess, row[new], each[new])
-        last, total, lost = np.where(new, made, last), np.where(new, 0.0, total), np.where(new, 0.0, lost)
-        lost += np.where(counted & (made >= 0), each, 0.0)
-        total += np.where(counted, each, 0.0)
-        latest = np.where(counted, each, latest)
-    table.excess[row], table.latest[row], table.lost[row], table.factor_step[row] = total, latest, lost, last
-
-
 def on_sent(table: UpdateTable, rows: Sequence[int], steps: Sequence[int]) -> None:
     """Takes note of copies that were sent, of some steps, in what the table has of them."""
     row = np.asarray(rows, np.int64)
     table.in_flight[row], table.copying[row], table.sent[row] = True, False, steps
     table.excess_sent[row], table.excess[row] = table.excess[row], 0.0
+
+
+def on_checks(table: UpdateTable, states: Sequence[BodyUpdateState], steps: Sequence[int]) -> None:
+    """Takes note that factors of some steps have come, which are checked beside the steps. table: that of the states"""
+    row, made = np.array([state._index for state in states]), np.asarray(steps)
+    table.checked[row] = made
+    table.in_flight[row] &= table.sent[row] != made
 
 
 def on_factors(
@@ -378,34 +324,15 @@ def on_factors(
 
     table: that of the states. step: during which they came
     """
-    row = np.array([state.body.index for state in states])
-    made = np.array([factor.step for factor in factors])
-    checked = made == table.checked[row]
-    came = checked | (table.in_flight[row] & (made == table.sent[row]))
-    _add(table.latency, row[came], np.maximum(1, step - made[came]))
-    table.checked[row[checked]] = NONE
-    table.in_flight[row] &= table.sent[row] > made
-    table.failures[row] = 0
-    newer = made > table.newest[row]
-    taken = row[newer]
-    _add(table.cost, taken, np.maximum([factor.seconds for factor in factors], MIN_SECONDS)[newer])
-    table.newest[taken] = made[newer]
-    table.used[taken] += 1
-    table.lost[taken] = 0.0
-    table.excess[taken] = table.latest[taken] = np.nan_to_num(table.first_excess[taken])
-    table.sent[taken] = np.where(table.sent[taken] == NONE, made[newer], table.sent[taken])
-    for state, factor, better in zip(states, factors, newer.tolist(), strict=True):
+    seconds = [max(factor.seconds, MIN_SECONDS) for factor in factors]
+    bodies, made = ([state._index for state in states], [factor.step for factor in factors])
+    newer = table.on_factors(np.array(bodies, np.int64), np.array(made, np.int64), np.array(seconds, np.float64), step)
+    for state, factor, cost, better in zip(states, factors, seconds, newer, strict=True):
         if state.job.positions:
             state.failures.assemblies = 0
         if better:
-            state.factors.note(factor, max(factor.seconds, MIN_SECONDS))
-    return list(newer.tolist())
-
-
-def _add(means: NDArray[np.float64], rows: NDArray[np.int64], values: NDArray[Any]) -> None:
-    """Adds a value to each of some running means, NaN where there was none."""
-    before = means[rows]
-    means[rows] = np.where(np.isnan(before), values, updated(before, values))
+            state.factors.note(factor, cost)
+    return newer
 
 
 def _remember(table: dict[int, Any], step: int, value: Any) -> None:

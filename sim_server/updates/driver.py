@@ -24,15 +24,14 @@ from sim_server.backends.base import Capability
 from sim_server.backends.cpu.structs import REACTION
 from sim_server.mechanics.world import Body
 from sim_server.simulation import Simulation
-from sim_server.updates.body_state import BodyUpdateState, on_factors
+from sim_server.updates.body_state import BodyUpdateState, on_checks, on_factors
 from sim_server.updates.factor_check import FactorCheck
 from sim_server.updates.factor_source import FactorSource, Inline, Job
 from sim_server.updates.patterns import Patterns
 from sim_server.updates.policies import make_policy
-from sim_server.updates.scheduler import UpdateRequests
 from sim_server.updates.snapshots import SnapshotPool
 from sim_server.updates.solve_observer import SolveObserver
-from sim_server.updates.update_table import NONE, UpdateTable
+from sim_server.updates.update_table import NONE, UpdateRequests, UpdateTable
 from sim_server.updates.useless_factors import UselessFactors
 
 log = logging.getLogger(__name__)
@@ -153,8 +152,8 @@ class Driver:
 
     def observe(self, records: NDArray[Any]) -> None:
         """Sums up what solves cost, lets `auto` choose, drops useless factors."""
-        self._observer.observe(records)
-        self.useless_factors.observe(records)
+        records = np.ascontiguousarray(records)
+        self.useless_factors.observe(records, self._observer.observe(records))
 
     # --- matrices out -------------------------------------------------------------------------------------------
 
@@ -165,40 +164,28 @@ class Driver:
             whose next matrix may go ahead of it, one alone: there are two places for copies. It does where factors
             have been of use and `auto` compares none
         """
-        t, step = self.table, self.engine.step
         tuners = [state.tuner for state in self.bodies] if self._tuned else []
-        on_trial = np.array([t is not None and t.wants_factor for t in tuners] or [False] * len(self.bodies))
-        age = np.where((t.newest >= 0) & ~t.dropped, step - t.newest, NONE)
-        iteration_cost, cost = (np.where(np.isnan(each), 1.0, each) for each in (t.iteration_cost, t.cost))
-        waited = np.where(t.sent >= 0, step - t.sent, NONE)
-        checked = t.checked != NONE
-        on_its_way = t.in_flight | t.copying | (False if ahead else checked)
-        every = UpdateRequests(
-            np.arange(len(t)), t.excess, waited, on_its_way, age, iteration_cost, cost, t.failures, t.lost, on_trial,
-            t.latest,
-        )  # fmt: skip
-        if not ahead:
-            return every.of(~t.frozen)
-        compared = np.array([t is not None and t.factorization.candidate is not None for t in tuners] or False)
-        last = checked & (t.sent == t.checked)
-        return every.of(last & ~t.frozen & (age >= 0) & (t.failures == 0) & ~compared)
+        on_trial = [t is not None and t.wants_factor for t in tuners]
+        compared = [t is not None and t.factorization.candidate is not None for t in tuners]
+        return self.table.requests(self.engine.step, ahead, on_trial, compared)
 
-    def make_job(self, state: BodyUpdateState) -> Job | None:
+    def make_job(self, state: BodyUpdateState, step: int | None = None) -> Job | None:
         """Returns the job of the copy that the loop has made for a body. None: the copy does not suffice and is
-        discarded."""
-        assert state.job.copy is not None
-        if self.snapshots.suffices(state) and self._is_present(state):
-            step = self.snapshots.step(state)
-            return self._job(state, step, state.job.copy, self.engine.staged_matrix(state.body.index))
+        discarded. step: of the copy, where that is known"""
+        copy = state.job.copy
+        assert copy is not None
+        step = self.snapshots.step(state) if step is None else step
+        if self.snapshots.suffices(state, step) and self._is_present(state, step):
+            return self._job(state, step, copy, self.engine.staged_matrix(state.body.index))
         self.snapshots.discard(state)
         return None
 
-    def _is_present(self, state: BodyUpdateState) -> bool:
+    def _is_present(self, state: BodyUpdateState, step: int) -> bool:
         """False if the copy is of a matrix from before the body was split for the last time, or after it."""
         s, body = self.simulation, state.body
         if s.splits is None:
             return True
-        epoch = s.epoch(body.name, self.snapshots.step(state))
+        epoch = s.epoch(body.name, step)
         blocks = int(s.system.row_start[body.last] - s.system.row_start[body.first])
         return epoch == s.epoch(body.name, s.engine.step) and blocks == len(self._patterns.at(body.name, epoch)[1])
 
@@ -261,24 +248,35 @@ class Driver:
             self._check_beside(together)
         elif together:
             at_once = [(f, self.snapshots.release(self.by_name[f.object], f.step)) for f in together]
-            self._take_up(together, self.check.reject_reasons(at_once))
+            self._take_up(together, self._reject_reasons(at_once))
         self.policy.on_job_end()
 
     def _may_check(self, state: BodyUpdateState, factor: Factor) -> bool:
         """False while a factor of the body is checked, or a large one could not be made ready at once: the checks of
         others would wait for it."""
         large = factor.values.nbytes > LARGE
-        return state.job.checked == NONE and (not large or self.engine.may_prepare(state.body.index))
+        return self.table.checked[state.body.index] == NONE and (not large or self.engine.may_prepare(state.body.index))
 
     def _check_beside(self, factors: Sequence[Factor]) -> None:
-        held = [self.snapshots.hold(self.by_name[f.object], f.step) for f in factors]
+        states = [self.by_name[factor.object] for factor in factors]
+        held = [self.snapshots.hold(state, factor.step) for state, factor in zip(states, factors, strict=True)]
         checked = [(factor, matrix) for factor, (_, matrix) in zip(factors, held, strict=True)]
-        for factor in factors:
-            self.by_name[factor.object].on_check(factor.step)
+        on_checks(self.table, states, [factor.step for factor in factors])
         applied = self._prepare(factors[0]) if len(factors) == 1 else None
-        reasons = self._checker.submit(self.check.reject_reasons, checked, applied)
+        reasons = self._checker.submit(self._reject_reasons, checked, applied)
         reasons.add_done_callback(lambda _: self.wake())
         self.checks.append(FactorsUnderCheck(factors, [memory for memory, _ in held], reasons))
+
+    def _reject_reasons(
+        self, checked: Sequence[tuple[Factor, Float64 | None]], applied: Callable[[], Float64 | None] | None = None
+    ) -> list[str]:  # fmt: skip
+        """Returns what FactorCheck.reject_reasons does. Whatever error it raises, none of the factors is used, and the
+        run goes on. From any thread."""
+        try:
+            return self.check.reject_reasons(checked, applied)
+        except Exception as error:
+            log.debug("the check of factors failed", exc_info=error)
+            return [f"its check failed: {type(error).__name__}: {error}" for _ in checked]
 
     def _prepare(self, factor: Factor) -> Callable[[], Float64 | None] | None:
         """Has a large factor made ready for use while it is checked, and applied for the check."""

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from protocol.factor import Factor, FactorPattern
+from protocol.located import Located, address
 from sim_server.arrays import Int32
 from sim_server.backends.compiler import native
 from sim_server.backends.cpu import structs
@@ -26,7 +27,7 @@ Reals = NDArray[np.float64]
 MAX_RESIDUAL = 0.05  # |r - A P^-1 r| / |r| of a factor that is to take the place of A; exact ones in float32 have 1e-3
 WITH_FACTOR, WITH_BLOCK_JACOBI = 1, 2  # parts of a judgement (factor_check.cpp)
 NO_VALUES = np.zeros(1, np.float32)
-WORK = 8  # numbers for each degree of freedom
+WORK = 9  # numbers for each degree of freedom
 MIN_SHARE = 0.9  # of what block Jacobi takes off, for a factor to be used; not 1, as one vector is not the space
 
 
@@ -47,26 +48,30 @@ class Probe(NamedTuple):
 
 @cache
 def _library() -> c.CDLL:
-    p = c.c_void_p
-    arguments = [c.c_int32, c.c_int32, c.POINTER(structs.Factor), p, p, p, p, p, p, p, p]
+    arguments = [c.c_int32, c.c_int32, *[c.c_void_p] * 9]
     library = native("backends/cpu/native/factor_check.cpp", {"wf_judge_all": (None, arguments)}, stepping=False)
     structs.LOOP.check_sizes(library)
     return library
 
 
+FACTOR = np.dtype(structs.Factor)
+
+
 class CheckedBody:
-    """What the check needs of an object: its pattern, that of its factor, and where native code finds them."""
+    """What the check needs of an object: its pattern, that of its factor, and where native code finds them.
+
+    addresses: of row_start, columns, the probe vector and the pattern of the factor
+    """
 
     def __init__(self, row_start: Int32, columns: Int32, probe: Reals, pattern: FactorPattern):
-        self.row_start, self.columns, self.probe = row_start, columns, probe
-        self.factor_pattern = NativePattern(pattern)
-        self.addresses = tuple(each.ctypes.data for each in (row_start, columns, probe))
-        self.native = c.addressof(self.factor_pattern.native)
+        self.row_start, self.columns, self.probe, self.pattern = row_start, columns, probe, pattern
+        self.nodes, self.nonzeros, self._native = len(row_start) - 1, pattern.nonzeros, NativePattern(pattern)
+        arrays = (each.ctypes.data for each in (row_start, columns, probe))
+        self.addresses = (*arrays, c.addressof(self._native.native))
 
     def fits(self, row_start: Int32, columns: Int32, pattern: FactorPattern) -> bool:
         """True if the arrays are still those."""
-        known = self.row_start is row_start and self.columns is columns
-        return known and self.factor_pattern.pattern is pattern
+        return self.row_start is row_start and self.columns is columns and self.pattern is pattern
 
 
 class FactorCheck:
@@ -104,18 +109,35 @@ class FactorCheck:
         applied: returns z = P^-1 r of the one factor, once who applies it beside this has it; None: nobody has
         """
         reasons = [self.wrong_size(factor) for factor, _ in checked]
-        fitting = [each for each, reason in zip(checked, reasons, strict=True) if not reason]
-        probes = iter(self.probe_all(fitting, applied))
-        return [reason or self._useless(*each, next(probes)) for each, reason in zip(checked, reasons, strict=True)]
+        fitting = [k for k, reason in enumerate(reasons) if not reason]
+        if not fitting:
+            return reasons
+        found = self._judged([checked[k] for k in fitting], applied)
+        for k in np.flatnonzero(self._may_be_useless(found)).tolist():
+            reasons[fitting[k]] = self._useless(*checked[fitting[k]], Probe(*found[k].tolist()))
+        return reasons
 
     def wrong_size(self, factor: Factor) -> str:
         """Returns why a factor is not of the size of its object; empty if it is."""
-        nodes = len(self._patterns.at(factor.object, factor.epoch)[0]) - 1
+        row_start, columns = self._patterns.at(factor.object, factor.epoch)
+        known, count = self._bodies.get(factor.object), len(factor.values)
+        if known is not None and known.fits(row_start, columns, factor.pattern) and count == known.nonzeros:
+            return ""  # as of the factor before
+        nodes = len(row_start) - 1
         if factor.pattern.size != 3 * nodes:
             return f"its size is {factor.pattern.size}, that of the object {3 * nodes}"
-        if len(factor.values) != factor.pattern.nonzeros:
-            return f"it has {len(factor.values)} values, its pattern {factor.pattern.nonzeros}"
+        if count != factor.pattern.nonzeros:
+            return f"it has {count} values, its pattern {factor.pattern.nonzeros}"
         return ""
+
+    def _may_be_useless(self, found: Reals) -> NDArray[np.bool_]:
+        """Returns for which columns of Probe, (k, 4), `_useless` may have a reason: all others have none."""
+        zr, reduction, block_jacobi, residual = found.T
+        good = (zr > 0) & (zr < np.inf) & (reduction >= MIN_SHARE * block_jacobi)
+        if self._alone:
+            good &= residual <= MAX_RESIDUAL
+        useless: NDArray[np.bool_] = ~good
+        return useless
 
     def _useless(self, factor: Factor, matrix: Reals | None, probe: Probe) -> str:
         zr, reduction, block_jacobi, residual = probe
@@ -141,17 +163,21 @@ class FactorCheck:
     ) -> list[Probe]:  # fmt: skip
         """Applies factors, each of which has the right size, to the probe vector r. From any thread. applied: as of
         `reject_reasons`"""
-        if not checked:
-            return []
+        return [Probe(*row) for row in self._judged(checked, applied).tolist()] if checked else []
+
+    def _judged(
+        self, checked: Sequence[tuple[Factor, Reals | None]], applied: Callable[[], Reals | None] | None
+    ) -> Reals:  # fmt: skip
+        """Returns the columns of Probe, (k, 4)."""
         out = np.zeros((len(checked), 5))
         if applied is None:
             self._judge(checked, WITH_FACTOR | WITH_BLOCK_JACOBI, None, out)
         else:  # block Jacobi meanwhile
             self._judge(checked, WITH_BLOCK_JACOBI, None, out)
             self._judge(checked, WITH_FACTOR, applied(), out)
-        za = np.where(out[:, [1, 3]] > 0, out[:, [1, 3]], np.inf)
-        energy = out[:, [0, 2]] ** 2 / za
-        return [Probe(*row) for row in np.column_stack([out[:, 0], energy, out[:, 4]]).tolist()]
+        za = np.where(out[:, 1:4:2] > 0, out[:, 1:4:2], np.inf)
+        energy = out[:, 0:4:2] ** 2 / za
+        return np.column_stack([out[:, 0], energy, out[:, 4]])
 
     def _judge(
         self, checked: Sequence[tuple[Factor, Reals | None]], parts: int, applied: Reals | None, out: Reals
@@ -163,22 +189,20 @@ class FactorCheck:
     def _judge_locked(
         self, checked: Sequence[tuple[Factor, Reals | None]], parts: int, applied: Reals | None, out: Reals
     ) -> None:  # fmt: skip
-        bodies = [self._body(factor) for factor, _ in checked]
+        bodies, count = [self._body(factor) for factor, _ in checked], len(checked)
         read = bool(parts & WITH_FACTOR) and applied is None  # those on a device would be copied
-        values = [np.ascontiguousarray(factor.values if read else NO_VALUES) for factor, _ in checked]
-        factors = np.zeros(len(checked), np.dtype(structs.Factor))
-        factors["pattern"], factors["values"] = [body.native for body in bodies], [_address(each) for each in values]
+        values = [_contiguous(factor.values) if read else NO_VALUES for factor, _ in checked]
+        row_start, columns, r, patterns = np.array([body.addresses for body in bodies], np.uintp).T.copy()
+        factors = np.zeros(count, FACTOR)
+        factors["pattern"], factors["values"] = patterns, [address(each) for each in values]
         factors["step"], factors["bytes"] = [f.step for f, _ in checked], [each.itemsize for each in values]
-        nodes = np.array([len(body.row_start) - 1 for body in bodies], np.int32)
+        nodes = np.array([body.nodes for body in bodies], np.int32)
         if (needed := WORK * 3 * int(nodes.max())) > len(self._work):
             self._work = np.empty(needed)
-        row_start, columns, r = np.array([body.addresses for body in bodies], np.uintp).T.copy()
-        matrices = np.array([0 if matrix is None else _address(matrix) for _, matrix in checked], np.uintp)
-        z = np.full(len(checked), 0 if applied is None else _address(applied), np.uintp)
-        _library().wf_judge_all(
-            len(checked), parts, factors.ctypes.data_as(c.POINTER(structs.Factor)),
-            *(each.ctypes.data for each in (nodes, row_start, columns, matrices, r, z, self._work, out)),
-        )  # fmt: skip
+        matrices = np.array([0 if matrix is None else address(matrix) for _, matrix in checked], np.uintp)
+        z = np.full(count, 0 if applied is None else address(applied), np.uintp)
+        arrays = factors, nodes, row_start, columns, matrices, r, z, self._work, out
+        _library().wf_judge_all(count, parts, *map(address, arrays))
 
     def _body(self, factor: Factor) -> CheckedBody:
         row_start, columns = self._patterns.at(factor.object, factor.epoch)
@@ -194,6 +218,5 @@ class FactorCheck:
         return self._vectors[size]
 
 
-def _address(array: NDArray[Any]) -> int:
-    address: int = array.__array_interface__["data"][0]
-    return address
+def _contiguous(values: NDArray[Any]) -> NDArray[Any]:
+    return values if isinstance(values, Located) and values.flags.c_contiguous else np.ascontiguousarray(values)

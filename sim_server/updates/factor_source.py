@@ -23,9 +23,9 @@ EXACT = Method()
 FactorMemory = Callable[[int, np.dtype[Any]], NDArray[Any]]
 
 
-@dataclass(frozen=True)
+@dataclass(eq=False, slots=True)
 class Job:
-    """A matrix to factorize.
+    """A matrix to factorize, which does not change: not frozen, since that takes three times as long to make.
 
     values: float64, blocks of the matrix (blocks, 3, 3), or positions (nodes, 3) [m] from which the worker assembles
         it; read during `submit`, or until the job is over

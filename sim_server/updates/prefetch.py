@@ -60,12 +60,20 @@ class PrefetchDepth:
         queued: several jobs wait at each worker, for which their transfer then takes no time. A few more copies are
             begun then than are sent in the time that they take
         """
-        known = seconds[~np.isnan(seconds)]
-        self.depth, period = 0, self._period.value
-        if len(known) and period is not None:
-            ahead, mean = max(period, self._copy.value or 0.0), float(known.mean())
+        self.depth, period, mean = 0, self._period.value, _mean(seconds)
+        if mean is not None and period is not None:
+            ahead = max(period, self._copy.value or 0.0)
             depth = workers * period / (mean + TRANSFER)
             if queued and self._rate.value is not None:
                 depth = max(depth, min(workers * ahead / mean, MORE * self._rate.value * ahead))
             self.depth = min(int(depth), MAX_DEPTH)
             self.patience = MAX_WAIT + int(ahead / period) - 1 if period > 0 else MAX_WAIT
+
+
+def _mean(values: Float64) -> float | None:
+    """The mean of those that are not NaN; None: there is none."""
+    mean = float(values.mean())
+    if mean == mean:
+        return mean
+    known = values[~np.isnan(values)]
+    return float(known.mean()) if len(known) else None

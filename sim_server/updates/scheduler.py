@@ -12,64 +12,17 @@ round_robin  the object whose matrix was sent longest ago
 Whatever the rule, an object whose last matrix is `overdue` goes first, so none starves.
 """
 
-from collections.abc import Callable
-from dataclasses import dataclass, fields
+import ctypes as c
 from math import ceil, inf
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sim_server.arrays import Float64, Int64
 from sim_server.scene.solver_options import Rule
+from sim_server.updates.update_table import COLUMNS, TEXT, Flags, UpdateRequests, address, addresses, library
 
-Flags = NDArray[np.bool_]
-
-OUTLOOK = 10.0  # steps for which the excess of the last solve is taken to go on
-MAX_DOUBLINGS = 10  # of the least interval between matrices of an object whose jobs fail
-
-
-@dataclass(frozen=True, eq=False)
-class UpdateRequests:
-    """What the scheduler knows of some bodies: arrays with an entry for each.
-
-    body: its number
-    excess: summed iterations above the floor
-    waited: steps since its last matrix was sent; -1: none was yet
-    in_flight: a matrix of it is being copied or factorized
-    age: steps since the matrix of its factor; -1: it has no factor
-    iteration_cost, factorization_cost: in any unit, as long as it is the same for all bodies
-    failures: jobs in a row that brought no factor
-    lost: summed iterations above the floor of solves with the factor in use
-    on_trial: a new factor is wanted for a comparison, whatever was lost
-    latest: excess of the last solve
-    """
-
-    body: Int64
-    excess: Float64
-    waited: Int64
-    in_flight: Flags
-    age: Int64
-    iteration_cost: Float64
-    factorization_cost: Float64
-    failures: Int64
-    lost: Float64
-    on_trial: Flags
-    latest: Float64
-
-    def __len__(self) -> int:
-        return len(self.body)
-
-    def of(self, chosen: Any) -> "UpdateRequests":
-        """Returns the requests that an index or a mask chooses."""
-        if isinstance(chosen, np.ndarray) and chosen.dtype == np.bool_ and chosen.all():
-            return self
-        return UpdateRequests(*(getattr(self, field.name)[chosen] for field in fields(self)))
-
-
-def expected_excess(requests: UpdateRequests) -> Float64:
-    """Returns the sums of bodies as they will be OUTLOOK steps from now if the excess of the last solve goes on."""
-    return requests.excess + OUTLOOK * requests.latest
+RULES: dict[Rule, int] = {"excess": TEXT.enumerators["BY_EXCESS"], "round_robin": TEXT.enumerators["BY_WAITING"]}
 
 
 def is_worthwhile(requests: UpdateRequests, threshold: float = 1.0) -> Flags:
@@ -82,12 +35,6 @@ def is_worthwhile(requests: UpdateRequests, threshold: float = 1.0) -> Flags:
     """
     lost = requests.lost * requests.iteration_cost
     return (requests.age < 0) | requests.on_trial | (lost >= threshold * requests.factorization_cost)
-
-
-_PRIORITY: dict[Rule, Callable[[UpdateRequests], NDArray[Any]]] = {
-    "excess": expected_excess,
-    "round_robin": lambda requests: requests.waited,
-}
 
 
 def pick(
@@ -103,15 +50,22 @@ def pick(
     the rule; among equals the one that waited longest, then by order. A body in flight is left out, and one whose
     last matrix was sent less than min_interval steps ago (twice as long after each failure).
     """
-    new = requests.waited < 0
-    rested = new | (requests.waited >= min_interval << np.minimum(requests.failures, MAX_DOUBLINGS))
-    ready = requests.of(np.flatnonzero(rested & ~requests.in_flight))
-    new, late = ready.waited < 0, ready.waited >= overdue
-    group = np.where(new, 0, np.where(late, 1, 2))
-    first = np.where(new, ready.excess, np.where(late, ready.waited, _PRIORITY[rule](ready)))
-    order = np.lexsort((np.where(new, 0, -ready.waited), -first, group))  # the last key is the first to count
-    chosen: list[int] = ready.body[order[: max(places, 0)]].tolist()
-    return chosen
+    places = min(max(places, 0), len(requests))
+    if not places:
+        return []
+    if (native := requests.native) is None:
+        columns: dict[str, NDArray[Any]] = {
+            name: np.ascontiguousarray(getattr(requests, name), kind)
+            for kind, names in COLUMNS.items()
+            for name in names
+        }
+        native = addresses(columns)
+    chosen = np.empty(places, np.int64)
+    count = library().wf_pick(
+        c.addressof(native), len(requests), places, min_interval, RULES[rule], overdue, address(chosen)
+    )  # fmt: skip
+    bodies: list[int] = chosen[:count].tolist()
+    return bodies
 
 
 def round_duration(latencies: ArrayLike, jobs: float) -> float:

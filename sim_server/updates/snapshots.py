@@ -32,24 +32,28 @@ class SnapshotPool:
         self._simulation, self._source, self._expected_latency = simulation, source, expected_latency
         self._solver = simulation.scene.solver
         self._requests = count()
-        self._requested: dict[int, BodyUpdateState] = {}  # by body; those that have been sent leave it later
+        self._requested: dict[int, BodyUpdateState] = {}  # by body, oldest first; what was sent leaves it later
+        self._shapes: dict[int, tuple[int, int, int]] = {}  # of the matrices of bodies, with room for all blocks
         self.free: dict[tuple[int, ...], list[NDArray[np.float64]]] = {}  # by shape; pages touched before
 
     def request(self, state: BodyUpdateState) -> None:
         """Asks the loop to copy when it assembles next: the matrix, or the positions if they suffice."""
         engine, body, job = self._simulation.engine, state.body, state.job
         job.request, job.requested = next(self._requests), time.monotonic()
+        self._requested.pop(body.index, None)  # to stand behind all others
         self._requested[body.index] = state
         if self._workers_assemble(state):
-            job.copy = self._allocate((body.last - body.first, 3))
+            copy = self._allocate((body.last - body.first, 3))
             job.extrapolated = self._extrapolated_time(state)
-            engine.request_positions(body.index, job.copy, job.extrapolated)
+            engine.request_positions(body.index, copy, job.extrapolated)
         else:
             job.extrapolated = 0.0
-            shape = self._simulation.system.most_blocks(body.first, body.last), 3, 3
+            if (shape := self._shapes.get(body.index)) is None:
+                shape = self._shapes[body.index] = (self._simulation.system.most_blocks(body.first, body.last), 3, 3)
             own = engine.copy_memory(body.index)
-            job.copy = own if own is not None and own.shape == shape else self._allocate(shape)
-            engine.request_matrix(body.index, job.copy)
+            copy = own if own is not None and own.shape == shape else self._allocate(shape)
+            engine.request_matrix(body.index, copy)
+        job.set_copy(copy)
 
     def step(self, state: BodyUpdateState) -> int:
         """Returns the steps completed before the one whose matrix was copied; -1: the copy is not there yet."""
@@ -58,18 +62,19 @@ class SnapshotPool:
 
     def completed(self) -> list[tuple[BodyUpdateState, int]]:
         """Returns the bodies whose copy is there, in the order of the requests, and the steps of these copies."""
-        self._requested = {k: state for k, state in self._requested.items() if state.job.copy is not None}
         steps = self._simulation.engine.matrix_steps(list(self._requested)).tolist()
         there = [(s, step) for s, step in zip(self._requested.values(), steps, strict=True) if step >= 0]
-        return sorted(there, key=lambda each: each[0].job.request)
+        for state in [state for state, _ in there if state.job.copy is None]:  # sent, or given up
+            del self._requested[state.body.index]
+        return [each for each in there if each[0].job.copy is not None]
 
-    def suffices(self, state: BodyUpdateState) -> bool:
-        """True if the copy is all that a worker needs. Positions do not tell of the springs of a grab, nor of other
-        parameters than those of the start, which may have come between the request and the copy."""
+    def suffices(self, state: BodyUpdateState, step: int) -> bool:
+        """True if the copy of a step is all that a worker needs. Positions do not tell of the springs of a grab, nor of
+        other parameters than those of the start, which may have come between the request and the copy."""
         assert state.job.copy is not None
         if state.job.copy.ndim == 3:
             return True
-        step, simulation = self.step(state), self._simulation
+        simulation = self._simulation
         known = all(e.known_to_workers_at(step) for e in simulation.effects.values())
         return known and simulation.parameters.known_to_workers_at(step)
 
@@ -77,7 +82,7 @@ class SnapshotPool:
         """Gives up a copy that is not sent."""
         assert state.job.copy is not None
         self.recycle(state.job.copy)
-        state.job.copy = None
+        state.job.set_copy(None)
 
     def release(self, state: BodyUpdateState, step: int = -1) -> NDArray[np.float64] | None:
         """Recycles the copy of the job in flight, which is over. Returns it if it is the matrix of `step`: to be read

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from protocol.messages_pb2 import RUNAWAY
 from sim_server.backends.kinds import Kind
 from sim_server.updates.autotune.convergence import Convergence, convergence
-from sim_server.updates.body_state import BodyUpdateState, observe_steps
+from sim_server.updates.body_state import BodyUpdateState
+from sim_server.updates.update_table import RAN_AWAY, told
 
 if TYPE_CHECKING:
     from sim_server.updates.driver import Driver
@@ -31,17 +32,19 @@ class SolveObserver:
         self._position = np.array([simulation.engine.settings(b.index).position for b in bodies])
         self._matrix_bytes = [BLOCK_BYTES * len(system.body_values(b.first, b.last)) for b in bodies]
 
-    def observe(self, records: NDArray[Any]) -> None:
-        """Sums up records of the loop, in their order."""
+    def observe(self, records: NDArray[Any]) -> int:
+        """Sums up contiguous records of the loop, in their order. Returns what they tell (update_table.told)."""
         states = self._driver.bodies
-        if self._driver.simulation.energies.freezes:
-            for body in set(records["body"][records["status"] == RUNAWAY].tolist()):
-                states[body].frozen = True
         whole_steps = len(records) >= max(len(states), MIN_TOGETHER) and len(records) % len(states) == 0
         if whole_steps and not self._driver.counted:
-            self._observe_steps(records.reshape(-1, len(states)))
+            tells = self._observe_steps(records.reshape(-1, len(states)))
         else:
             self._observe_each(records)
+            tells = told(records)
+        if tells & RAN_AWAY and self._driver.simulation.energies.freezes:
+            for body in set(records["body"][records["status"] == RUNAWAY].tolist()):
+                states[body].frozen = True
+        return tells
 
     def _observe_each(self, records: NDArray[Any]) -> None:
         driver, solver = self._driver, self._driver.solver
@@ -61,12 +64,13 @@ class SolveObserver:
             )  # fmt: skip
             driver.apply_choice(state)
 
-    def _observe_steps(self, r: NDArray[Any]) -> None:
-        """Sums up whole steps, (steps, bodies): where bodies are many, their factors wait for this function."""
+    def _observe_steps(self, r: NDArray[Any]) -> int:
+        """Sums up whole steps, (steps, bodies): where bodies are many, their factors wait for this function. Returns
+        what they tell."""
         driver, states = self._driver, self._driver.bodies
-        observe_steps(driver.table, r, driver.solver.update_floor_iterations)
+        tells = driver.table.observe(r, driver.solver.update_floor_iterations)
         if not self._tuned:
-            return
+            return tells
         shortfall, used = convergence(r, driver.solver, self._position)
         solves = np.maximum(r["linearizations"], 1)
         begun = (r["kind"], r["iterations"] / solves, r["solve"] / solves, r["asked"])
@@ -76,6 +80,7 @@ class SolveObserver:
             if state.tuner is not None:
                 state.tuner.observe_steps(*rows, [(state.factors.method(step), step) for step in factor_steps])
                 driver.apply_choice(state)
+        return tells
 
     def _bytes_moved(self, state: BodyUpdateState, kind: Kind, iterations: int) -> float:
         """Returns the bytes that a solve moved, about: the deterministic stand-in for its time."""

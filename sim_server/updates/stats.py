@@ -6,8 +6,10 @@ from typing import Any
 import numpy as np
 
 from protocol.factor import FactorPattern
+from sim_server.backends.declarations import Declarations
 
-MEMORY = 0.2  # weight of the newest value in a running mean
+MEMORY: float = Declarations("updates/update_table.cpp").constant("MEMORY")
+"""Weight of the newest value in a running mean."""
 
 
 def updated(mean: Any, value: Any) -> Any:

@@ -17,6 +17,7 @@ from protocol.factor import Factor
 from sim_server.backends.base import Capability
 from sim_server.backends.kinds import Kind
 from sim_server.updates.body_state import BodyUpdateState
+from sim_server.updates.update_table import ABANDONED
 
 if TYPE_CHECKING:
     from sim_server.updates.driver import Driver
@@ -72,11 +73,12 @@ class UselessFactors:
         self._suspects.add(self._driver.by_name[factor.object].body.index)
         self._source.factor_failed(factor.worker, factor.object)
 
-    def observe(self, records: NDArray[Any]) -> None:
-        """Takes note of solves. It costs nothing while none of them abandons its factor."""
-        abandoned = records["fallbacks"] > 0
-        if not self._driver.policy.renews or not (self._suspects or abandoned.any()):
+    def observe(self, records: NDArray[Any], told: int) -> None:
+        """Takes note of solves. It costs nothing while none of them abandons its factor. told: what the records tell
+        (update_table.told)"""
+        if not self._driver.policy.renews or not (self._suspects or told & ABANDONED):
             return
+        abandoned = records["fallbacks"] > 0
         suspected = np.zeros(len(self._counters), np.bool_)
         suspected[list(self._suspects)] = True
         suspected[records["body"][abandoned]] = True

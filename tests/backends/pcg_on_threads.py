@@ -19,10 +19,13 @@ from sim_server.backends.compiler import INCLUDE, SOURCES, compiler
 from sim_server.backends.cpu.structs import BALANCE
 from sim_server.backends.gpu import contact as gpu_contact
 from sim_server.backends.gpu import solver as gpu_solver
+from sim_server.backends.gpu import solver_layout
 from sim_server.backends.gpu.contact import ContactPasses
 from sim_server.backends.gpu.correction import CORRECTED_BODY, FactorCorrection
+from sim_server.backends.gpu.host_results import ContactResults
 from sim_server.backends.gpu.row_partition import assign_blocks
 from sim_server.backends.gpu.solver import PCG_RESULT, PcgSolver
+from sim_server.backends.gpu.solver_features import SolverFeatures
 from sim_server.backends.gpu.structs import CONTACT_RESULT, PCG
 from sim_server.backends.kinds import KINDS
 from sim_server.simulation import Simulation
@@ -192,11 +195,11 @@ class Solver:
         self, sim: Simulation, monkeypatch: pytest.MonkeyPatch, near: int = 0, blocks: int = 1,
         host: SolverHost | None = None, phases: Sequence[Any] = (), alone: bool = False,
     ):  # fmt: skip
-        monkeypatch.setattr(gpu_solver, "alone", lambda *a: alone)
-        monkeypatch.setattr(gpu_solver, "threads_and_blocks", lambda *a: (THREADS, 1))
+        monkeypatch.setattr(solver_layout, "alone", lambda *a: alone)
+        monkeypatch.setattr(solver_layout, "threads_and_blocks", lambda *a: (THREADS, 1))
         monkeypatch.setattr(gpu_solver, "compiled", lambda name, module, kernel: SimpleNamespace())
         assigned = lambda nodes, processors, most: (assign_blocks(nodes, blocks), blocks)  # noqa: E731
-        monkeypatch.setattr(gpu_solver, "best_assignment", assigned)
+        monkeypatch.setattr(solver_layout, "best_assignment", assigned)
         self.sim, self.near = sim, near
         self.gpu: Any = host or SolverHost()
         given = sim.engine_input()
@@ -210,10 +213,11 @@ class Solver:
         sites = int(given.contact.body_start[-1]) // 2 if given.contact else 0
         self.correction = FactorCorrection(gpu, sim.scene.solver.woodbury, list(given.ranges), touch, sites)
         self.counter, contact = as_device(np.zeros(1, np.int64)), given.contact is not None
-        self.solver = PcgSolver(
-            gpu, given.ranges, given.arrays, self.counter, 4, contact=contact, correction=self.correction,
-            errors=given.errors or budgets, phases=phases, budgets=budgets, cut=given.cut,
+        features = SolverFeatures(
+            contact=contact, correction=self.correction, errors=given.errors or budgets, phases=phases,
+            budgets=budgets, cut=given.cut,
         )  # fmt: skip
+        self.solver = PcgSolver(gpu, given.ranges, given.arrays, self.counter, 4, features)
         rows = self.solver.bodies
         assert rows["blocks"].sum() == blocks
         rows["tolerance"], rows["max_iterations"], rows["warm_start"] = (
@@ -296,7 +300,7 @@ class ContactSolver(Solver):
         self.told, self.reactions = np.zeros((4, 1), CONTACT_RESULT), np.zeros((4, 1, obstacles, 6))
         self.passes = ContactPasses(
             self.gpu, device, given.contact, given.ranges, given.arrays, self.solver, as_device(np.zeros(1, BALANCE)),
-            self.told, self.reactions, np.zeros(0, np.int32), self.correction,
+            ContactResults(self.told, self.reactions, np.zeros(0, np.int32), None), self.correction,
         )  # fmt: skip
         self.solver.params["b"] = self.passes.memory["contact_b"].data.ptr
 

@@ -16,7 +16,7 @@ from sim_server.backends.gpu import kernel_fusion
 from sim_server.backends.gpu.device import PRECISIONS, own_headers
 from sim_server.backends.gpu.device import options as device_options
 from sim_server.backends.gpu.energies import BALANCE_TEXT
-from sim_server.backends.gpu.engine import EPILOGUE
+from sim_server.backends.gpu.step_sequence import EPILOGUE
 from sim_server.backends.kernel_binding import domain_of, members_of
 from sim_server.scene.elements import PATCHED
 from tests.support import nvrtc

@@ -94,8 +94,8 @@ class Maker:
             storage[:] = [int(each[0])]
         return [PartitionedInverse(storage, self.events[-1]) for storage in storages]
 
-    def reserve_vectors(self, body: int, plan: Any) -> None:
-        return
+    def reserve_vectors(self, body: int, plan: Any) -> bool:
+        return False
 
     def apply(self, inverse: PartitionedInverse, r: np.ndarray, multiprocessors: int | None = None) -> np.ndarray:
         """In place of a factor the number that it is."""

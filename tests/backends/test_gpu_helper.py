@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 
 from precond_worker.factorization.factorize import Analysis
-from sim_server.backends.gpu import solver
+from sim_server.backends.gpu import helper, solver_layout
+from sim_server.backends.gpu.loop import DeviceLoop
 from sim_server.errors import DeviceError, InputError
 from sim_server.simulation import Simulation
 from tests.backends import fake_cupy
@@ -16,7 +17,7 @@ from tests.support import nvrtc
 def cupy(tmp_path, monkeypatch):
     if (library := nvrtc.library()) is None:
         pytest.skip("needs the package nvidia-cuda-nvrtc")
-    monkeypatch.setattr(solver, "LEAST_NODES", 10)
+    monkeypatch.setattr(helper, "LEAST_NODES", 10)
     with fake_cupy.installed(tmp_path, library, monkeypatch) as fake:
         fake.cuda.runtime.getDeviceCount = lambda: 2
         yield fake
@@ -58,14 +59,41 @@ def test_scenes_that_two_gpus_do_not_solve_are_refused(overrides, words):
         Simulation.load("deploy/scenes/beam.toml", ["solver.gpus=2", *overrides], "gpu")
 
 
+@pytest.mark.parametrize("how", ["run", "close_step"])
+def test_two_scenes_that_make_steps_at_once_are_refused_in_place_of_waiting_for_ever(monkeypatch, how):
+    """One after the other they go; so does one beside a scene with one GPU."""
+    first, second = (Simulation.load("deploy/scenes/beam.toml", ["solver.gpus=2"], "gpu") for _ in range(2))
+    single = Simulation.load("deploy/scenes/beam.toml", [], "gpu")
+    whole, tried = getattr(DeviceLoop, how), []
+
+    def beside(loop: DeviceLoop, *given: int) -> int | None:
+        if loop is first.engine and not tried:
+            tried.append(loop)
+            with pytest.raises(
+                InputError, match=r"solver.gpus = 2: another scene of this process makes steps on these"
+            ):
+                second.engine.run(1)
+            assert single.engine.run(1) == 1
+        return whole(loop, *given)
+
+    monkeypatch.setattr(DeviceLoop, how, beside)
+    if how == "run":
+        first.engine.run(2)
+    else:
+        first.engine.assemble()
+        first.engine.solve()
+    assert tried and second.engine.run(1) == 1 and second.engine.step == 1
+    assert first.engine.run(1) == 1
+
+
 def test_small_bodies_are_refused(monkeypatch):
-    monkeypatch.setattr(solver, "LEAST_NODES", 100_000)
+    monkeypatch.setattr(helper, "LEAST_NODES", 100_000)
     with pytest.raises(InputError, match=r"solver.gpus = 2: the largest object has \d+ nodes.* allowed is 1"):
         Simulation.load("deploy/scenes/beam.toml", ["solver.gpus=2"], "gpu")
 
 
 def test_many_bodies_are_refused_whatever_the_size_of_the_largest(monkeypatch):
-    monkeypatch.setattr(solver, "threads_and_blocks", lambda *given: (128, 2))
+    monkeypatch.setattr(solver_layout, "threads_and_blocks", lambda *given: (128, 2))
     with pytest.raises(InputError, match=r"solver.gpus = 2 with 1 objects, of which a multiprocessor takes several"):
         Simulation.load("deploy/scenes/beam.toml", ["solver.gpus=2"], "gpu")
 

@@ -696,3 +696,21 @@ def test_matrices_of_another_type_or_large_ones_have_no_memory_of_the_loop(monke
         scene.loop.request_matrix(1, target)
         scene.loop.run(40)
         assert scene.loop.matrix_step(1) == step and (target == step).all()
+
+
+@pytest.mark.parametrize("real", ["f4", "f8"])
+@pytest.mark.parametrize("doubled", [True, False])
+def test_the_memory_of_copies_is_what_the_limit_of_memory_counts(monkeypatch, real, doubled):
+    if not doubled:
+        monkeypatch.setattr(loop_module, "DOUBLED", 100)
+    scene, made = FakeScene(bodies=3, real=real), []
+
+    def pinned(size: int) -> np.ndarray:
+        made.append(size)
+        return np.zeros(size, np.uint8)
+
+    monkeypatch.setattr(scene.device, "pinned", pinned)
+    scene.loop.prepare_copies()
+    scene.loop.prepare_copies()
+    assert made == [loop_module.bytes_of_copies([2, 2, 2], real)]
+    assert made == [(2 if doubled else 1) * 3 * 2 * 9 * np.dtype(real).itemsize]

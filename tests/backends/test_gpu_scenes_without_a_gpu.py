@@ -401,7 +401,7 @@ def test_steps_by_the_factor_alone_look_for_cuts_where_a_body_may_be_cut(cupy):
         if not cuttable:
             del given["object"][0]["effects"]["cutting"]
         sim = Simulation(Scene.model_validate(given, context={"folder": "."}), "gpu")
-        own[cuttable] = sim.engine.stages.solve_arguments(0)
+        own[cuttable] = sim.engine.sequence.stages.solve_arguments(0)
         if cuttable:
             known = sim.world.backend.known_twin(sim.cutting.changed_at)
             assert own[True]["changed_at"] == known.data.ptr and known.dtype == np.float64

@@ -16,14 +16,14 @@ from sim_server.backends.gpu.contact import TEXT as CONTACT_TEXT
 from sim_server.backends.gpu.device import PRECISIONS, own_headers
 from sim_server.backends.gpu.device import options as device_options
 from sim_server.backends.gpu.energies import BALANCE_TEXT, ELASTIC_TEXT
-from sim_server.backends.gpu.engine import EPILOGUE
 from sim_server.backends.gpu.inverse.apply_inverse import APPLICATION
 from sim_server.backends.gpu.inverse.expansion_batches import INVERSE
 from sim_server.backends.gpu.measured import TEXT as MEASURED_TEXT
 from sim_server.backends.gpu.momentum import MOMENTUM
 from sim_server.backends.gpu.newton import BLOCK_NODES, NEWTON, bodies_of, node_ranges
 from sim_server.backends.gpu.rosenbrock import DECISION
-from sim_server.backends.gpu.solver import threads_and_blocks
+from sim_server.backends.gpu.solver_layout import threads_and_blocks
+from sim_server.backends.gpu.step_sequence import EPILOGUE
 from sim_server.backends.gpu.structs import PCG
 from tests.support import nvrtc
 

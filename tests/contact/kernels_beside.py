@@ -18,6 +18,7 @@ from sim_server.backends.gpu import contact as gpu_contact
 from sim_server.backends.gpu import faces as gpu_faces
 from sim_server.backends.gpu import islands as gpu_islands
 from sim_server.backends.gpu.contact import ContactPasses
+from sim_server.backends.gpu.host_results import ContactResults
 from sim_server.backends.gpu.solver import PCG_BODY
 from sim_server.backends.gpu.structs import CONTACT_RESULT, CONTACT_STATE, PAIR_SUM, PCG_RESULT
 from sim_server.backends.kinds import KINDS
@@ -226,8 +227,8 @@ class Beside:
         gpu: Any = self.gpu
         self.pairs = np.zeros((4, bodies, bodies), PAIR_SUM), np.zeros((4, bodies), np.int32)
         self.passes = ContactPasses(
-            gpu, device, self.contact, given.ranges, given.arrays, solver, self.balance, self.told, self.reactions,
-            self.broken, told=self.pairs,
+            gpu, device, self.contact, given.ranges, given.arrays, solver, self.balance,
+            ContactResults(self.told, self.reactions, self.broken, self.pairs),
         )  # fmt: skip
         self.arrays, self.ranges = given.arrays, np.array(given.ranges, np.int32)
         self.bodies["first"], self.bodies["nodes"] = self.ranges[:, 0], np.diff(self.ranges)[:, 0]

@@ -118,3 +118,37 @@ def test_what_is_held_apart_is_told_of_all_bodies_that_are_solved_together():
     sim.engine.run(1)
     clipped = sim.engine.records()["clipped"]
     assert clipped[0] == clipped[1] == clipped[2] > 0
+
+
+def stacked(speed: float, gap: float, linearizations: int = 1, **contact: float) -> Simulation:
+    """Two blocks over each other that fall on a floor; the upper one has a speed of its own."""
+    size, cells = (0.08, 0.04, 0.08), (2, 1, 2)
+    low = block(name="low", cells=cells, size=size, at=(0, 2 * D, 0))
+    high = block(name="high", cells=cells, size=size, at=(0.01, 0.04 + gap, 0.005))
+    given = {"thickness": D, "passes": 1, "tolerance": 0.9} | contact
+    sim = over(objects=[low, high], solver=JACOBI, integrator={"linearizations": linearizations}, contact=given)
+    for body, v in zip(sim.world.bodies, (-6.0, -speed), strict=True):
+        sim.world.v[body.nodes] = (0, v, 0)
+    return sim
+
+
+def test_nodes_that_are_set_back_at_an_obstacle_are_told_of_their_own_body():
+    """And so is the status: the other one, solved with it, ends where the solve did."""
+    sim = stacked(0, 2.5 * D, stiffness=1e-4)
+    sim.engine.run(1)
+    records = sim.engine.records()
+    assert records["contact_residual"][0] == records["contact_residual"][1], "they are solved together"
+    assert records["clipped"][0] > 0 and records["clipped"][1] == 0
+    assert records["status"].tolist() == [STATUS["CONTACT"], STATUS["CONVERGED"]]
+
+
+@pytest.mark.parametrize("linearizations", [1, 4])
+def test_those_set_back_before_bodies_are_held_apart_still_count(linearizations):
+    """Passes have run out by then: what was set back stays so."""
+    if linearizations == 1:
+        sim, steps = stacked(6.0, 4 * D, stiffness=0.003), 1
+    else:
+        sim, steps = stacked(0.0, 2.5 * D, linearizations, stiffness=1e-4), 2
+    sim.engine.run(steps)
+    low, high = sim.engine.records()["clipped"][-2:]
+    assert low > high > 0, "more of the lower one are, and places are told of both"

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from sim_server.backends.gpu.faces import DEFINED
-from sim_server.backends.gpu.islands import ISLAND, TALLY, tree_heights
+from sim_server.backends.gpu.island_memory import ISLAND, TALLY, tree_heights
 from sim_server.backends.gpu.structs import PAIR_SUM
 from sim_server.backends.kinds import KINDS
 from sim_server.simulation import Simulation
@@ -217,6 +217,7 @@ class IslandsBeside(Beside):
         self.seen += len(told)
 
 
+STATUS = KINDS.enumeration("Status")
 TIGHT: dict[str, Any] = {"preconditioner": "block_jacobi", "tolerance": 1e-11, "max_iterations": 3000}
 HEIGHT = 0.04
 CELLS, SIZE = (2, 1, 2), (0.08, 0.04, 0.08)
@@ -339,6 +340,22 @@ def test_edges_that_cross_between_their_nodes(library, monkeypatch, stiffness):
         beside.near(1e-6)
         used, sweeps = max(used, edge_rows(beside)), sweeps + beside.tally["rounds"]
     assert used > 0 and (sweeps > 0) == (stiffness < 1)
+
+
+def test_nodes_that_are_set_back_are_told_of_their_own_body(library, monkeypatch):
+    """As on the CPU, and so is the status: the other one, solved with it, ends where the solve did."""
+    blocks = [
+        block(cells=CELLS, size=SIZE, name="low", at=(0, 2 * D, 0)),
+        block(cells=CELLS, size=SIZE, name="high", at=(0.01, 2.5 * D + HEIGHT, 0.005)),
+    ]
+    soft = {"thickness": D, "tolerance": 0.9, "passes": 1, "stiffness": 1e-4}
+    sim = over(objects=blocks, solver=TIGHT, contact=soft)
+    sim.world.v[sim.world.bodies[0].nodes] = (0, -6, 0)
+    beside = IslandsBeside(library, sim, monkeypatch)
+    records = beside.near(1e-3)
+    assert beside.tally["islands"] == 1 and records["passes"].all()
+    assert records["clipped"][0] > 0 and records["clipped"][1] == 0
+    assert records["status"].tolist() == [STATUS["CONTACT"], STATUS["CONVERGED"]]
 
 
 @pytest.mark.parametrize("what", ["vertices", "edges"])

@@ -23,7 +23,7 @@ from sim_server.errors import InputError
 from sim_server.mesh import check, read
 from sim_server.mesh.surface import volumes
 from sim_server.scene import load
-from sim_server.service.commands import Commands
+from sim_server.service.commands import FAILED, Commands
 from tests.sample_run import positions
 from tests.scenes import bar, simulation
 
@@ -123,7 +123,7 @@ def _read(name: str, message: Any, data: bytes) -> None:
     elif name == "Command":
         check_name(message.client, "Command.client")
         there = commands()
-        there.carry_out(message)
+        assert not there.carry_out(message).error.startswith(FAILED), "an error that no check foresees"
         there.carry_out(messages_pb2.Command(client="anna", verb="resume"))  # or the step would wait
         there.simulation.engine.run(1)
         assert np.isfinite(there.simulation.world.x).all(), "not finite"

@@ -71,7 +71,7 @@ def test_a_start_near_the_solution_is_no_trouble(precision, nearness):
         sim.engine.gpu.twin(sim.system.moving)[:] = 1  # the end of a step has taken it back
         sim.engine.solver.launch()
         stream.synchronize()
-    step = int(sim.engine._counter.get()[0])
+    step = int(sim.engine.sequence.counter.get()[0])
     results = sim.engine.solver.results.get().view(PCG_RESULT)
     last = results[step % (len(results))]
     assert last["status"] == SolveStatus.CONVERGED and last["residual"] <= 1e-11

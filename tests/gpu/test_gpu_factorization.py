@@ -1,12 +1,15 @@
 # SPDX-License-Identifier: MIT
 """Factors made on a GPU beside those of the CPU. Runs where there is a GPU: pytest -m gpu."""
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 from scipy.sparse import bsr_matrix, csc_matrix
 
 from precond_worker.factorization.factorize import Analysis, NotPositiveDefinite
+from precond_worker.many import GivenMatrices, Made
 from protocol.factor import FactorPattern
 from sim_server.simulation import Simulation
 from tests.reference import supernodal
@@ -69,6 +72,13 @@ def test_elastic_bodies_are_factorized_as_on_the_cpu(overrides, library):
     assert np.linalg.norm(x - expected) < 1e-3 * np.linalg.norm(expected)
 
 
+def begun(analysis: Analysis, matrices: list[NDArray]) -> Callable[[], Made]:
+    """Begins to factorize matrices together; what is returned waits for it."""
+    made = analysis.begin_many(GivenMatrices(matrices))
+    assert made is not None and made.beside
+    return made.end
+
+
 @pytest.mark.parametrize("graph", [GRAPHS["bar"], COMMON["chain"]], ids=["bar", "chain"])
 @arithmetic
 def test_many_together_are_to_the_bit_those_one_by_one(graph, library):
@@ -78,13 +88,13 @@ def test_many_together_are_to_the_bit_those_one_by_one(graph, library):
     one_by_one = [analysis.factorize(matrix).copy() for matrix in matrices]
     assert analysis.most >= 5
     for count in (2, 5, 3, 1):
-        together = analysis.begin_many(matrices[:count])()
-        assert together is not None and len(together) == count
-        assert all(map(np.array_equal, together, one_by_one))
-    assert analysis.begin_many([matrices[0], -matrices[1], matrices[2]])() is None
-    assert analysis.begin_many([matrices[0], np.full_like(matrices[1], np.nan)])() is None
-    together = analysis.begin_many(matrices[3:])()
-    assert together is not None and all(map(np.array_equal, together, one_by_one[3:]))
+        together = begun(analysis, matrices[:count])()
+        assert together.good.tolist() == [True] * count
+        assert all(map(np.array_equal, together.values, one_by_one))
+    assert not begun(analysis, [matrices[0], -matrices[1], matrices[2]])().good.any()
+    assert not begun(analysis, [matrices[0], np.full_like(matrices[1], np.nan)])().good.any()
+    together = begun(analysis, matrices[3:])()
+    assert together.good.all() and all(map(np.array_equal, together.values, one_by_one[3:]))
 
 
 @arithmetic
@@ -94,14 +104,14 @@ def test_two_may_be_under_way(library):
     analysis = Analysis(*graph, library)
     matrices = [spd(*graph, seed=seed) for seed in range(6)]
     one_by_one = [analysis.factorize(matrix).copy() for matrix in matrices]
-    first, second = analysis.begin_many(matrices[:3]), analysis.begin_many(matrices[3:])
+    first, second = begun(analysis, matrices[:3]), begun(analysis, matrices[3:])
     for end, expected in ((first, one_by_one[:3]), (second, one_by_one[3:])):
-        assert all(map(np.array_equal, end(), expected))
-    spoilt, good = analysis.begin_many([matrices[0], -matrices[1]]), analysis.begin_many(matrices[4:])
-    assert spoilt() is None and all(map(np.array_equal, good(), one_by_one[4:]))
-    again = analysis.begin_many(matrices[2:4]), analysis.begin_many(matrices[:2])
-    assert all(map(np.array_equal, again[0](), one_by_one[2:4]))
-    assert all(map(np.array_equal, again[1](), one_by_one[:2]))
+        assert all(map(np.array_equal, end().values, expected))
+    spoilt, good = begun(analysis, [matrices[0], -matrices[1]]), begun(analysis, matrices[4:])
+    assert not spoilt().good.any() and all(map(np.array_equal, good().values, one_by_one[4:]))
+    again = begun(analysis, matrices[2:4]), begun(analysis, matrices[:2])
+    assert all(map(np.array_equal, again[0]().values, one_by_one[2:4]))
+    assert all(map(np.array_equal, again[1]().values, one_by_one[:2]))
 
 
 @arithmetic

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from protocol.messages_pb2 import SolveStatus
-from sim_server.backends.gpu import solver
+from sim_server.backends.gpu import solver_layout
 from sim_server.backends.gpu.row_partition import assign_blocks
 from sim_server.simulation import Simulation
 from sim_server.updates.driver import Driver
@@ -28,7 +28,7 @@ def test_as_on_the_cpu(blocks, overrides, tmp_path, monkeypatch):
     path = scene(tmp_path / "large.toml", [(5, 5, 20)])
     cpu = Simulation.load(path, [], "cpu")
     expected = Driver(cpu).advance(9)
-    monkeypatch.setattr(solver, "best_assignment", lambda nodes, *_: (assign_blocks(nodes, blocks), blocks))
+    monkeypatch.setattr(solver_layout, "best_assignment", lambda nodes, *_: (assign_blocks(nodes, blocks), blocks))
     sim = Simulation.load(path, overrides, "gpu")
     found = Driver(sim).advance(9)
     assert sim.engine.solver.grid == blocks

@@ -370,7 +370,7 @@ def test_rounding_of_single_precision_ends_the_search(precision):
 
 def test_a_step_with_one_linearization_has_nothing_of_it():
     engine = Simulation(scene(MODELS["corotational"](), gravity=GRAVITY, **TIGHT), "gpu").engine
-    assert engine._newton is None and engine.solver._phases == () and not engine.loop.newton_results
+    assert engine.sequence.newton is None and engine.solver.features.phases == () and not engine.loop.newton_results
     assert all(all(row) for row in engine.loop.graphs)
 
 

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from protocol.messages_pb2 import SolveStatus
-from sim_server.backends.gpu import solver
+from sim_server.backends.gpu import helper, solver_layout
 from sim_server.backends.gpu.row_partition import assign_blocks
 from sim_server.simulation import Simulation
 from sim_server.updates.driver import Driver
@@ -24,7 +24,7 @@ def two_gpus(monkeypatch):
 
     if cupy().cuda.runtime.getDeviceCount() < 2:
         pytest.skip("needs two GPUs")
-    monkeypatch.setattr(solver, "LEAST_NODES", 10)
+    monkeypatch.setattr(helper, "LEAST_NODES", 10)
 
 
 def run(path, steps, *overrides):
@@ -49,7 +49,7 @@ def test_as_on_the_cpu(blocks, overrides, tmp_path, monkeypatch):
     cpu = Simulation.load(path, single, "cpu")
     expected = Driver(cpu).advance(9)
     if blocks:
-        monkeypatch.setattr(solver, "best_assignment", lambda nodes, *_: (assign_blocks(nodes, blocks), blocks))
+        monkeypatch.setattr(solver_layout, "best_assignment", lambda nodes, *_: (assign_blocks(nodes, blocks), blocks))
     sim, found = run(path, 9, *overrides)
     row = sim.engine.solver.bodies[0]
     assert row["helper"] > 0 and (found["status"] == SolveStatus.CONVERGED).all()
@@ -106,6 +106,6 @@ def test_a_body_that_loses_elements():
 
 
 def test_small_bodies_are_refused(tmp_path, monkeypatch):
-    monkeypatch.setattr(solver, "LEAST_NODES", 10_000)
+    monkeypatch.setattr(helper, "LEAST_NODES", 10_000)
     with pytest.raises(Exception, match=r"solver.gpus = 2: the largest object has .* nodes"):
         run(scene(tmp_path / "small.toml", [(2, 2, 4)]), 1)

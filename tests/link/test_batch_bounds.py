@@ -5,7 +5,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from precond_worker.batch import accept_batch
+from precond_worker.jobs.batch import accept_batch
 from protocol.channels import PROTOCOL, key
 from protocol.messages_pb2 import Header, MatrixBatch, Slot
 from protocol.refused import Refused

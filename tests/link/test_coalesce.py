@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Commands that arrived together: which are checked, which are replaced, and how each is answered."""
 
+import itertools
 import logging
 from types import SimpleNamespace
 from typing import Any
@@ -13,6 +14,7 @@ from protocol.channels import PROTOCOL, key
 from protocol.counters import Counters
 from protocol.messages_pb2 import Command, Header, Interaction, ObstacleTarget, Reply, Vector
 from protocol.refused import Refused
+from sim_server.network import queryables as module
 from sim_server.network.coalesce import coalesce_moves
 from sim_server.network.queryables import Queryables
 
@@ -127,6 +129,25 @@ def test_each_of_a_round_is_answered_once(queryables: Queryables, counters: Coun
     assert wrong.answers[0].error == "Vector.x is nan; allowed: finite"
     assert not elsewhere.answers and elsewhere.dropped == 1
     assert counters.moves_replaced == 39 and counters.refused == 3
+
+
+@pytest.mark.parametrize("fails", ["parse", "check_client"])
+def test_an_error_that_no_check_foresees_costs_the_others_of_a_round_nothing(
+    queryables: Queryables, counters: Counters, monkeypatch: pytest.MonkeyPatch, fails: str
+) -> None:
+    called, sound = itertools.count(), getattr(module, fails)
+
+    def broken(*arguments: Any) -> Any:
+        if next(called) == 1:
+            raise IndexError("nose")
+        return sound(*arguments)
+
+    monkeypatch.setattr(module, fails, broken)
+    pushes = [Query(command("push").SerializeToString()) for _ in range(3)]
+    queryables.serve_all(list(pushes), None)  # type: ignore[arg-type]
+    assert len(queryables.commands()) == 2 and counters.refusals["unexpected"] == 1
+    (reply,) = pushes[1].answers
+    assert reply.error.startswith("a Command: IndexError: nose (test_coalesce.py:")
 
 
 def test_names_of_obstacles_that_wait_are_short(queryables: Queryables) -> None:

@@ -83,6 +83,18 @@ def test_no_more_than_may_be_lent_and_none_far_too_large(memory: Gated) -> None:
     assert sum(memory.asked[1:]) <= memory.limit
 
 
+def test_an_error_of_the_driver_costs_one_slot(memory: Gated, caplog: pytest.LogCaptureFixture) -> None:
+    slots, allocate = DeviceSlots(memory), memory.allocate
+
+    def broken(size: int) -> Allocation | None:
+        memory.allocate = allocate  # type: ignore[method-assign]
+        raise RuntimeError("cudaErrorUnknown")
+
+    memory.allocate = broken  # type: ignore[method-assign]
+    soon(lambda: slots.lend([MIB]))
+    assert "device memory for matrices and factors is not there: cudaErrorUnknown" in caplog.text
+
+
 def test_a_server_that_can_share_none_lends_none(memory: Gated) -> None:
     memory.allocate = lambda size: None  # type: ignore[method-assign]
     slots = DeviceSlots(memory)

@@ -190,6 +190,24 @@ def test_one_that_nobody_waits_for_any_more_ends_before_it_asks() -> None:
     assert session.asked == []
 
 
+def test_an_answer_that_cannot_be_read_leaves_time_for_the_right_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    values, take = values_of(9), ArrivingFactor.take
+    data, tries = bytes_of(values), iter([True, False])
+
+    def broken(arriving: ArrivingFactor, number: int, data: Any) -> None:
+        if number == 1 and next(tries, False):
+            raise TypeError("no bytes")
+        take(arriving, number, data)
+
+    monkeypatch.setattr(ArrivingFactor, "take", broken)
+    monkeypatch.setattr(factor_fetch, "PAUSE", 0.0)
+    before = COUNTERS.refusals["unexpected"]
+    session = ScriptedSession(data, 12, {})
+    assert np.array_equal(fetch_of(session, 9, 12, part_checksums(data, 12)).run(), values)
+    assert sorted(session.asked) == [0, 1, 1, 2]
+    assert COUNTERS.refusals["unexpected"] == before + 1
+
+
 # --- answering ------------------------------------------------------------------------------------------------------
 
 
@@ -251,6 +269,6 @@ def test_a_factor_is_kept_until_its_object_has_another_or_nobody_asks(offered: O
     clock.now = 1.1 * offered_factors.KEPT
     offered.expire()
     assert offered.kept == 1 and ask(offered, 0, 3)
-    offered.withdraw("beam")
-    offered.withdraw("beam")
+    offered.withdraw(["beam"])
+    offered.withdraw(["beam"])
     assert offered.kept == 0

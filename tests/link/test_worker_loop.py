@@ -5,15 +5,15 @@ import json
 import logging
 import re
 import sys
-from collections.abc import Callable
 from types import SimpleNamespace
 from typing import Any, ClassVar
 
 import numpy as np
 import pytest
 
-from precond_worker import worker as worker_loop
 from precond_worker.errors import DeviceUnusable
+from precond_worker.jobs import preparation
+from precond_worker.many import Begun, Made, Matrices
 from precond_worker.network.presence import ServerGone, ServersThere
 from precond_worker.network.receive_queue import ReceiveQueue
 from precond_worker.worker import Worker
@@ -68,8 +68,9 @@ class FakeOffers:
         self.kept[object] = job, values
         return part_checksums(bytes_of(values), part_bytes)
 
-    def withdraw(self, object: str) -> None:
-        self.kept.pop(object, None)
+    def withdraw(self, objects: list[str]) -> None:
+        for object in objects:
+            self.kept.pop(object, None)
 
     def clear(self) -> None:
         self.kept.clear()
@@ -240,11 +241,11 @@ def test_a_server_that_does_not_tell_yet_what_it_simulates_is_asked_again(
         return told()
 
     monkeypatch.setattr(connection, "scene", scene)
-    monkeypatch.setattr(worker_loop, "ASK_AGAIN", 1000.0)
+    monkeypatch.setattr(preparation, "ASK_AGAIN", 1000.0)
     ahead.step(0.0)
     assert ahead.idle and ahead.waiting == 0 and 900 < ahead.pause < 1000, "nobody waits for that"
-    monkeypatch.setattr(worker_loop, "ASK_AGAIN", 0.0)
-    ahead.ask_at = 0.0
+    monkeypatch.setattr(preparation, "ASK_AGAIN", 0.0)
+    ahead.preparation.ask_at = 0.0
     while ahead.waiting:
         ahead.step(0.0)
     assert refusals == -1 and Ready.made == [3 * LARGE] and ahead.pause == float("inf")
@@ -257,7 +258,7 @@ def test_a_server_that_tells_nothing_is_not_asked_after_its_first_job(
         raise Refused("the server does not tell what it simulates", "object")
 
     monkeypatch.setattr(connection, "scene", scene)
-    monkeypatch.setattr(worker_loop, "ASK_AGAIN", 0.0)
+    monkeypatch.setattr(preparation, "ASK_AGAIN", 0.0)
     for _ in range(5):
         ahead.step(0.0)
     assert ahead.pause == 0.0
@@ -298,29 +299,34 @@ def test_what_cannot_be_prepared_is_left_for_the_first_job(
     drain(ahead, connection, matrix(object="first"))
     assert [answer.failure for answer, _ in connection.answers] == [""], "it lives on"
     monkeypatch.setattr(Ready, "error", DeviceUnusable("gone"))
-    ahead.unprepared.append("large")
+    ahead.preparation.unprepared.append("large")
     with pytest.raises(DeviceUnusable):
         ahead.step(0.0)
 
 
 class Together(Diagonal):
-    """Factorizes up to three matrices of one pattern together."""
+    """Factorizes up to three matrices of one pattern together, on a device unless `beside` is False."""
 
-    most = 3
+    most, together, beside = 3, 3, True
     sizes: ClassVar[list[int]] = []
     ended: ClassVar[list[int]] = []
 
-    def begin_many(self, values: list[np.ndarray], dtype: Any) -> Callable[[], list[np.ndarray] | None]:
-        self.sizes.append(len(values))
+    def begin_many(self, matrices: Matrices, dtype: Any) -> Begun:
+        given = np.empty((len(matrices), 9 * matrices.blocks))
+        matrices.copy_to(given)
+        self.sizes.append(len(given))
 
-        def end() -> list[np.ndarray] | None:
-            self.ended.append(len(values))
-            try:
-                return [self.factorize(each, dtype) for each in values]
-            except ValueError:
-                return None
+        def end() -> Made:
+            self.ended.append(len(given))
+            values, good = np.zeros((len(given), self.size), dtype), np.ones(len(given), bool)
+            for k, each in enumerate(given):
+                try:
+                    values[k] = self.factorize(each.reshape(-1, 3, 3), dtype)
+                except ValueError:
+                    good[k] = False
+            return Made(values, good)
 
-        return end
+        return Begun(end, self.beside)
 
 
 @pytest.fixture

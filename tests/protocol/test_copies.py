@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from protocol.shared_memory import copies as module
-from protocol.shared_memory.copies import SOURCE, Copies
+from protocol.shared_memory.copies import SOURCE, Copies, Parts
 from protocol.validate import ALONE, checksum
 from sim_server.backends.compiler import build
 
@@ -60,6 +60,27 @@ def test_what_others_write_to_the_targets_changes_no_checksum(made):
     assert [each.tobytes() for each in bytes_of_targets] == [each.tobytes() for each in sources]
 
 
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_they_are_taken_in_one_behind_the_other_and_what_is_not_positive_is_found(made, dtype):
+    sources = [np.abs(each) + 1 for each in arrays(dtype, SIZES[1:])]
+    shared = np.array([0, 2, 40, 59])  # of those of 60 and of 61 numbers
+    places = [np.array([0]), np.array([], np.int64), shared, shared, np.array([4095]), np.array([0, 70_000])]
+    sources[0][0], sources[1][:], sources[2][41] = 0, -1, -1  # only the first is looked at
+    sources[3][59], sources[4][17], sources[5][-1] = -0.0, np.inf, np.nan
+    memory = np.full(sum(map(len, sources)), np.nan, dtype)
+    sums, finite, positive = made.take(sources, memory, places)
+    assert memory.tobytes() == b"".join(each.tobytes() for each in sources)
+    assert sums == [checksum(each) for each in sources]
+    assert finite == [True] * 4 + [False] * 2
+    assert positive == [False, True, True, False, True, False]
+
+
+def test_memory_of_another_size_or_type_is_a_mistake_of_the_caller(made):
+    for memory in (np.zeros(5), np.zeros(3), np.zeros(4, np.float32), np.zeros(8)[::2]):
+        with pytest.raises((AssertionError, ValueError)):
+            made.take([np.zeros(4)], memory, [np.array([0])])
+
+
 def test_many_large_arrays_are_shared_by_threads(made, monkeypatch):
     monkeypatch.setattr(module, "helping_threads", lambda: 3)
     sources = arrays(np.float64, [ALONE // 8 // 6] * 9)
@@ -98,3 +119,40 @@ def test_where_the_system_gives_no_more_threads_one_copies_all():
 def test_sizes_that_differ_are_a_mistake_of_the_caller(made):
     with pytest.raises((AssertionError, ValueError)):
         made.copy([np.zeros(4)], [np.zeros(3)])
+
+
+PARTS = np.array([8, 4096, 800, 100]), np.array([0, 4112, 24, 640])  # bytes of parts, and where each begins
+
+
+def test_parts_of_one_array_are_copied_to_parts_of_another(made):
+    size, begin = PARTS
+    source, target = np.arange(2000.0), np.full(2000, np.nan)
+    to = begin[::-1] + np.array([5, 1000, 0, 9000])
+    sums = made.copy_parts(Parts(source, begin), Parts(target, to), size)
+    parts = [source.view(np.uint8)[a : a + n] for a, n in zip(begin, size, strict=True)]
+    assert sums == [checksum(each) for each in parts] == made.sum_parts(Parts(source, begin), size)
+    expected = np.full(2000, np.nan).view(np.uint8)
+    for a, n, each in zip(to, size, parts, strict=True):
+        expected[a : a + n] = each
+    assert expected.tobytes() == target.tobytes()
+
+
+def test_checksums_of_parts_are_of_the_side_that_is_told(made):
+    """Of what this process alone writes to: here the two are the same memory at two places."""
+    size, memory = np.array([64]), np.arange(24.0)
+    overlapping = Parts(memory, np.array([0])), Parts(memory.view(np.uint8), np.array([128]))
+    assert made.copy_parts(*overlapping, size, own_sources=True) == [checksum(memory[:8])] == [checksum(memory[16:])]
+
+
+@pytest.mark.parametrize(("begin", "size"), [(-8, 8), (9, 8), (0, 17), (0, -8), (1 << 62, 1 << 62)])
+def test_parts_outside_of_their_array_are_refused(made, begin, size):
+    array, inside = np.zeros(2), np.zeros(100)
+    parts, size = Parts(array, np.array([0, begin])), np.array([8, size])
+    whole = Parts(inside, np.array([0, 64]))
+    for call in (
+        lambda: made.sum_parts(parts, size),
+        lambda: made.copy_parts(parts, whole, size),
+        lambda: made.copy_parts(whole, parts, size),
+    ):
+        with pytest.raises(ValueError, match="outside of its"):
+            call()

@@ -7,9 +7,11 @@ from pathlib import Path
 
 import pytest
 
+from sim_server import backends
 from sim_server.errors import InputError
 from sim_server.scene import load
 from sim_server.scene.size_limits import Size, SizeLimits, estimate
+from sim_server.simulation import Simulation
 
 ROOT = Path(__file__).parents[2]
 OBJECT = """
@@ -104,6 +106,44 @@ def test_two_factors_of_half_the_size_are_smaller() -> None:
     half, whole = Size(6000, 1300), Size(12_000, 2600)
     assert estimate([whole], False) == estimate([half, half], False) < estimate([half, half], True)
     assert estimate([half, half], True) < estimate([whole], True)
+
+
+CHOLESKY = ["solver.preconditioner='cholesky'", "object.o0.elements='{}'"]
+
+
+@pytest.mark.parametrize("kind", ["linear", "patch", "smoothed", "quadratic"])
+def test_blocks_of_matrices_are_near_those_that_there_are(kind: str, tmp_path: Path) -> None:
+    """Of a small bar, whose nodes at the surface have fewer neighbours: up to a third more."""
+    given = load(scene(tmp_path, [6, 6, 8]), [CHOLESKY[1].format(kind)])
+    blocks = len(Simulation(given).system.columns)
+    told: list[float] = []
+    SizeLimits(None, 1e12).check(
+        given.model_copy(update={"solver": load(given.path, CHOLESKY[:1]).solver}),
+        lambda counts: told.extend(counts) or 0.0,
+    )
+    assert len(told) == 1 and blocks <= told[0] <= 1.34 * blocks
+
+
+def test_copies_of_matrices_of_a_gpu_are_counted() -> None:
+    """Two places for each matrix while all of them have half a GiB, else one, in the type of the device."""
+    mib = 1 << 20
+    double, single = (backends.bytes_of_copies("gpu", precision) for precision in ("mixed", "float32"))
+    assert backends.bytes_of_copies("cpu", "float64") is None and double is not None and single is not None
+    for blocks, mixed, alone in ((mib, 144, 72), (7 * mib, 1008, 504), (8 * mib, 576, 576), (15 * mib, 1080, 540)):
+        sizes = [Size(10, 10, blocks // 2)] * 2
+        before = estimate(sizes, True)
+        assert (estimate(sizes, True, double) - before, estimate(sizes, True, single) - before) == pytest.approx(
+            (mixed * mib, alone * mib)
+        )
+        assert estimate(sizes, False, double) == estimate(sizes, False), "none is copied"
+
+
+def test_a_scene_that_fits_on_a_cpu_may_not_fit_on_a_gpu(tmp_path: Path) -> None:
+    path, limits = scene(tmp_path, [28, 28, 43]), SizeLimits(None, 1.63e9)
+    changes = [CHOLESKY[0], CHOLESKY[1].format("linear")]
+    limits.check(load(path, changes), backends.bytes_of_copies("cpu", "float64"))
+    with pytest.raises(InputError, match="--max-memory allows"):
+        Simulation.load(path, changes, "gpu", limits)
 
 
 @pytest.mark.parametrize("size", ["much", "4", "1KB", "-4GB", "1e3GB"])

@@ -62,3 +62,16 @@ def test_only_a_paused_server_takes_single_steps_and_only_so_many(commands: Comm
     assert commands.carry_out(pb.Command(client="anna", verb="step", steps=1_000_001)).error == (
         "steps = 1000001: at most 1000000"
     )
+
+
+def test_an_error_that_no_check_foresees_is_told_and_the_run_goes_on(
+    commands: Commands, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def broken(*arguments: object) -> None:
+        raise KeyError("nose")
+
+    monkeypatch.setattr(commands.simulation.touch, "push", broken)
+    assert push(commands).error == "it failed: KeyError: 'nose'"
+    assert "command push of anna failed" in caplog.text
+    monkeypatch.undo()
+    assert push(commands).error == ""

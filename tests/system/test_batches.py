@@ -20,6 +20,7 @@ from protocol.shared_memory.view import SlotMap
 from protocol.validate import checksum
 from sim_server.network import factor_intake, job_sender, worker_choice
 from sim_server.network.batch_message import MOST_TOGETHER
+from sim_server.network.factor_decoder import FactorDecoder
 from sim_server.network.link import ServerLink
 from sim_server.network.send_queue import SendQueue
 from sim_server.updates.factor_source import Job
@@ -233,6 +234,28 @@ def test_what_is_wrong_with_one_costs_the_others_nothing(stage: Hand, name: str)
     assert stage.driver.link.counters.refusals[kind] == before + 1 and stage.driver.link.slots_lent == 0
 
 
+@pytest.mark.parametrize("beside", [False, True], ids=["at once", "in a thread"])
+def test_an_error_that_no_check_foresees_costs_its_message_alone(
+    stage: Hand, beside: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def broken(*arguments: Any) -> None:
+        raise IndexError("index 7 is out of bounds")
+
+    if beside:
+        monkeypatch.setattr(factor_intake, "LARGE_MESSAGE", 0)
+    batch, refusals = stage.batch(), stage.driver.link.counters.refusals["unexpected"]
+    monkeypatch.setattr(FactorDecoder, "_taken", broken)
+    stage.send(stage.answer(batch, [0, 2]))
+    stage.driver.until(lambda: stage.failed() == {"a", "c"}, "the refusals")
+    assert "was refused: factors of a and 1 more by worker hand: IndexError" in stage.driver.failures[0][1]
+    assert stage.driver.link.counters.refusals["unexpected"] == refusals + 2
+    monkeypatch.undo()
+    stage.send(stage.answer(batch, [1, 3]))
+    stage.driver.until(lambda: all_are_back(stage), "the others")
+    stage.check_factors()
+    assert stage.made() == {"b", "d"} and stage.driver.link.slots_lent == 0
+
+
 def test_a_failed_job_is_told_with_its_reason(stage: Hand) -> None:
     batch = stage.batch()
     message = stage.answer(batch)
@@ -286,7 +309,7 @@ def test_answers_of_no_job_and_second_answers_are_refused_one_by_one(stage: Hand
 
 def test_large_batches_are_decoded_beside_the_caller(stage: Hand, monkeypatch: pytest.MonkeyPatch) -> None:
     """All count as large here. Meanwhile nothing is taken and second answers are refused; then each counts alone."""
-    monkeypatch.setattr(factor_intake, "LARGE", 0)
+    monkeypatch.setattr(factor_intake, "LARGE_MESSAGE", 0)
     batch, go = stage.batch(), threading.Event()
     decode, before = stage.driver.link.dispatch.decoder.decode_several, stage.driver.link.counters.refusals["duplicate"]
 

@@ -111,6 +111,33 @@ def test_one_that_is_to_take_the_place_of_the_matrix_is_its_factor(dtype):
     assert check.reject_reasons([(regularized, matrix)])[0] == "", "it cannot be"
 
 
+def several(sim: Simulation, matrix: NDArray) -> list[tuple[Factor, NDArray | None]]:
+    """Good and bad factors of several patterns and types, with and without their matrix."""
+    good = [made(sim), made(sim, dtype=np.float64), made(sim, GOOD[3]), made(sim, GOOD[2])]
+    bad = [changed(factor, how) for how in BAD for factor in good[:3]]
+    cut = dataclasses.replace(good[0], values=good[0].values[:-1])
+    found: list[tuple[Factor, NDArray | None]] = []
+    mixed = [good[0], bad[0], good[0], bad[9], bad[12]]  # of one pattern, which are applied together
+    for k, factor in enumerate([*mixed, cut] + [good[1]] * 5 + good + bad[:13] + [good[0]] * 6 + bad[13:] + mixed):
+        found.append((factor, None if k % 5 == 3 else matrix))
+    return found
+
+
+@pytest.mark.parametrize("alone", [False, True])
+def test_each_of_many_is_judged_as_if_it_came_alone(alone):
+    """To the bit."""
+    sim = bent()
+    check, matrix = check_of(sim, alone)
+    many = several(sim, matrix)
+    reasons = check.reject_reasons(many)
+    assert 10 < sum(map(bool, reasons)) < len(many) - 10
+    for each, reason in zip(many, reasons, strict=True):
+        assert check_of(sim, alone)[0].reject_reasons([each]) == [reason]
+    fitting = [each for each in many if not check.wrong_size(each[0])]
+    together, one = check.probe_all(fitting), [check_of(sim)[0].probe(*each) for each in fitting]
+    assert np.array(together).tobytes() == np.array(one).tobytes()
+
+
 class OnDevice:
     """Values that lie on a device."""
 
@@ -232,13 +259,13 @@ def test_the_copy_of_a_matrix_is_kept_until_its_factor_came(monkeypatch):
     places: set[int] = set()
     reject_reasons = driver.check.reject_reasons
 
-    def looked(checked: Sequence[tuple[Factor, NDArray | None]]) -> list[str]:
+    def looked(checked: Sequence[tuple[Factor, NDArray | None]], *applied: None) -> list[str]:
         for factor, matrix in checked:
             values = matrix if matrix is not None else np.zeros(1)
             fresh = made_of(driver, values) if matrix is not None else None
             places.add(values.ctypes.data)
             seen.append((factor.step, fresh is not None and np.array_equal(fresh, factor.values)))
-        return reject_reasons(checked)
+        return reject_reasons(checked, *applied)
 
     monkeypatch.setattr(driver.check, "reject_reasons", looked)
     driver.advance(20)

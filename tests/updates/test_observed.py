@@ -15,7 +15,9 @@ from sim_server.recording import messages
 from sim_server.service.telemetry import Telemetry
 from sim_server.updates.body_state import on_factors
 from sim_server.updates.driver import Driver
+from sim_server.updates.scheduler import pick
 from sim_server.updates.solve_observer import MIN_TOGETHER
+from sim_server.updates.update_table import ABANDONED, NONE, RAN_AWAY, UpdateTable, told
 from tests.scenes import bar, simulation
 
 BODIES, STEPS = 3, 40
@@ -129,7 +131,54 @@ def test_many_factors_say_what_each_says():
     assert one.bodies[0].factors.cost_by_method and one.bodies[0].factors.regularized
 
 
-def told(listening: bool, monkeypatch) -> tuple[list[pb.Steps], list[pb.Status], int]:
+@pytest.mark.parametrize("ahead", [False, True])
+def test_requests_say_what_the_table_holds(ahead):
+    """Of every mixture of what may be known of a body."""
+    rng, bodies, step = np.random.default_rng(3), 600, 50
+    table = UpdateTable(bodies)
+    for column in (table.excess, table.latest, table.lost):
+        column[:] = rng.uniform(0, 9, bodies)
+    for column in (table.iteration_cost, table.cost):
+        column[:] = np.where(rng.random(bodies) < 0.3, np.nan, rng.uniform(1e-6, 1e-3, bodies))
+    for column in (table.newest, table.sent):
+        column[:] = rng.integers(-1, step, bodies)
+    table.checked[:] = np.where(rng.random(bodies) < 0.5, table.sent, rng.integers(-1, step, bodies))
+    table.failures[:] = rng.integers(0, 3, bodies)
+    for column in (table.dropped, table.in_flight, table.copying, table.frozen):
+        column[:] = rng.random(bodies) < 0.3
+    on_trial, compared = (rng.random((2, bodies)) < 0.4).tolist()
+    age = np.where((table.newest >= 0) & ~table.dropped, step - table.newest, NONE)
+    checked = table.checked != NONE
+    wanted = ~table.frozen
+    if ahead:
+        wanted &= checked & (table.sent == table.checked) & (age >= 0) & (table.failures == 0) & ~np.array(compared)
+    assert 0 < wanted.sum() < bodies
+    expected = {
+        "body": np.arange(bodies), "age": age, "waited": np.where(table.sent >= 0, step - table.sent, NONE),
+        "in_flight": table.in_flight | table.copying | (checked & (not ahead)), "failures": table.failures,
+        "excess": table.excess, "latest": table.latest, "lost": table.lost, "on_trial": np.array(on_trial),
+        "iteration_cost": np.nan_to_num(table.iteration_cost, nan=1.0),
+        "factorization_cost": np.nan_to_num(table.cost, nan=1.0),
+    }  # fmt: skip
+    found = table.requests(step, ahead, on_trial, compared)
+    assert {name: getattr(found, name).tolist() for name in expected} == {
+        name: column[wanted].tolist() for name, column in expected.items()
+    }
+    assert pick(found, 9) == pick(found.of(np.arange(len(found))), 9)
+    flying = table.in_flight | checked
+    assert table.counts() == (table.copying.sum(), flying.sum(), (table.failures > 0).sum())
+
+
+def test_records_tell_of_bodies_that_ran_away_and_of_factors_that_were_left():
+    records = np.zeros(9, RECORD)
+    assert told(records[:0]) == told(records) == 0
+    records["fallbacks"][7] = 2
+    assert told(records) == ABANDONED and told(records[:7]) == 0
+    records["status"][3] = pb.RUNAWAY
+    assert told(records) == ABANDONED | RAN_AWAY and told(records[:7]) == RAN_AWAY
+
+
+def published(listening: bool, monkeypatch) -> tuple[list[pb.Steps], list[pb.Status], int]:
     """Steps and statuses that went out, and how many messages of steps were made before the status was."""
     driver = drivers("cholesky")[0]
     made, sent, statuses = [], [], []
@@ -148,7 +197,7 @@ def told(listening: bool, monkeypatch) -> tuple[list[pb.Steps], list[pb.Status],
 
 
 def test_steps_become_messages_only_if_somebody_listens(monkeypatch):
-    sent, statuses, made = told(False, monkeypatch)
+    sent, statuses, made = published(False, monkeypatch)
     assert (sent, made) == ([], 0)
     assert [o.last.step for o in statuses[0].objects] == [10] * BODIES
     r = solves(np.random.default_rng(0), 0, 10)
@@ -156,11 +205,11 @@ def test_steps_become_messages_only_if_somebody_listens(monkeypatch):
 
 
 def test_a_listener_gets_every_step(monkeypatch):
-    sent, _, made = told(True, monkeypatch)
+    sent, _, made = published(True, monkeypatch)
     assert made == 30 and [s.step for s in sent[0].steps] == sorted([*range(1, 11)] * 3) and sent[0].left_out == 0
 
 
 def test_a_listener_is_told_how_many_were_left_out(monkeypatch):
     monkeypatch.setattr("sim_server.service.telemetry.MAX_BATCH", 7)
-    sent, _, made = told(True, monkeypatch)
+    sent, _, made = published(True, monkeypatch)
     assert made == 7 and len(sent[0].steps) == 7 and sent[0].left_out == 23

@@ -22,6 +22,7 @@ from sim_server.backends.kinds import Kind
 from sim_server.simulation import Simulation
 from sim_server.updates import driver as driver_module
 from sim_server.updates.driver import Driver
+from sim_server.updates.factor_check import FactorCheck
 from sim_server.updates.factor_source import Inline, Job
 from sim_server.updates.policies.free_running import MAX_REQUESTS, Adaptive
 from sim_server.updates.stats import flops
@@ -492,6 +493,26 @@ def test_a_large_factor_that_is_no_use_is_refused_beside_the_steps(sent):
     wait([each.reasons for each in driver.checks])
     assert driver.advance(2)["factor_step"].tolist() == [-1, -1]
     assert driver.bodies[0].failures.refused == 1 and not driver.bodies[0].job.in_flight
+
+
+@pytest.mark.parametrize("beside", [True, False], ids=["beside the steps", "at once"])
+def test_a_check_that_fails_by_itself_refuses_the_factor_and_the_run_goes_on(sent, monkeypatch, beside):
+    driver, factor, _ = sent
+    if not beside:
+        monkeypatch.setattr(driver_module, "LARGE", 1 << 40)
+    check = driver.check._judged
+    monkeypatch.setattr(driver.check, "reject_reasons", FactorCheck.reject_reasons.__get__(driver.check))
+    monkeypatch.setattr(driver.check, "_judged", lambda *_: {}["nose"])
+    driver.adopt([factor])
+    wait([each.reasons for each in driver.checks])
+    assert driver.advance(2)["factor_step"].tolist() == [-1, -1]
+    assert driver.bodies[0].failures.refused == 1 and not driver.checks
+    assert driver.bodies[0].failures.reported == {"that of w is not used: its check failed: KeyError: 'nose'"}
+    monkeypatch.setattr(driver.check, "_judged", check)
+    driver.adopt([replace(factor, step=driver.engine.step)])
+    wait([each.reasons for each in driver.checks])
+    driver.advance(1)
+    assert driver.bodies[0].factors.used == 1
 
 
 @pytest.fixture

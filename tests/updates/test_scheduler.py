@@ -11,7 +11,7 @@ import pytest
 from sim_server.backends.cpu.structs import RECORD
 from sim_server.backends.rosenbrock import FORMS
 from sim_server.scene.solver_options import Rule
-from sim_server.updates.body_state import BodyUpdateState, excess
+from sim_server.updates.body_state import BodyUpdateState
 from sim_server.updates.scheduler import (
     UpdateRequests,
     is_worthwhile,
@@ -20,6 +20,7 @@ from sim_server.updates.scheduler import (
     pick,
     round_duration,
 )
+from sim_server.updates.update_table import UpdateTable
 
 NEW, BUSY = None, True
 RULES = get_args(Rule)
@@ -44,7 +45,7 @@ class Row:
 
 def together(rows: list[Row]) -> UpdateRequests:
     """As arrays; an object's number is its place."""
-    columns = ([getattr(r, f.name) for r in rows] for f in dataclasses.fields(UpdateRequests)[1:])
+    columns = ([getattr(r, f.name) for r in rows] for f in dataclasses.fields(UpdateRequests)[1:-1])
     kinds = (float, int, bool, int, float, float, int, float, bool, float)
     arrays = (
         np.array([-1 if value is None else value for value in column], kind)
@@ -85,7 +86,10 @@ def steps() -> np.ndarray:
 def test_excess():
     """Of many steps together and of each alone."""
     expected = [row[-1] for row in STEPS]
-    assert excess(steps(), 3, 0.02).tolist() == pytest.approx(expected)
+    table = UpdateTable(len(STEPS))
+    table.error_bound[:] = 0.02
+    table.observe(steps().reshape(1, -1), 3)
+    assert table.latest.tolist() == pytest.approx(expected)
     for record, value in zip(steps(), expected, strict=True):
         state = BodyUpdateState(None, error_bound=0.02)
         state.observe(record, 3, 1.0)
@@ -289,3 +293,43 @@ def test_of_equal_needs_the_oldest_goes_first(rule, spread, places):
             oldest = max(oldest, int((step - newest).max()))
     longest = 1 + spread
     assert oldest <= math.ceil(bodies / places) * longest + 2 * longest
+
+
+def ranked(q: UpdateRequests, places: int, min_interval: int, rule: Rule, overdue: float) -> list[int]:
+    """The rule of `pick` by sorting whole columns."""
+    new = q.waited < 0
+    rested = new | (q.waited >= min_interval << np.minimum(q.failures, 10))
+    ready = q.of(np.flatnonzero(rested & ~q.in_flight))
+    new, late = ready.waited < 0, ready.waited >= overdue
+    need = ready.excess + 10.0 * ready.latest if rule == "excess" else ready.waited
+    first = np.where(new, ready.excess, np.where(late, ready.waited, need))
+    group = np.where(new, 0, np.where(late, 1, 2))
+    order = np.lexsort((np.where(new, 0, -ready.waited), -first, group))
+    return ready.body[order[:places]].tolist()
+
+
+def random_requests(rng: np.random.Generator, bodies: int, fractions: bool) -> UpdateRequests:
+    """With many equal ones, or with sums whose last digits decide; of some the sums are infinite or no number."""
+    sums, latest = rng.integers(0, 5, (2, bodies)).astype(float)
+    if fractions:
+        sums, latest = 0.1 * sums + rng.uniform(0, 1e-15, bodies), 0.01 * latest
+        sums[rng.random(bodies) < 0.05], sums[rng.random(bodies) < 0.05] = np.nan, np.inf
+    flags = rng.random((2, bodies)) < 0.3
+    return UpdateRequests(
+        rng.permutation(3 * bodies)[:bodies], sums, rng.integers(-1, 20, bodies), flags[0], rng.integers(-1, 9, bodies),
+        np.ones(bodies), np.ones(bodies), rng.integers(0, 4, bodies) * (rng.random(bodies) < 0.2), sums, flags[1],
+        latest,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("rule", RULES)
+@pytest.mark.parametrize("fractions", [False, True])
+def test_the_most_urgent_are_those_that_come_first_when_all_are_sorted(rule, fractions):
+    rng = np.random.default_rng(0)
+    for bodies in (1, 2, 7, 100, 1500):
+        for overdue in (math.inf, 7.5, 0.0):
+            q = random_requests(rng, bodies, fractions)
+            for places in (0, 1, bodies // 3, bodies, bodies + 5):
+                for interval in (1, 3):
+                    found = pick(q, places, interval, rule, overdue)
+                    assert found == ranked(q, places, interval, rule, overdue)

@@ -96,9 +96,9 @@ while [ "$1" != -o ]; do shift; done
 exec g++ -shared -x c++ /dev/null -o "$2"
 """
 NEEDED = (  # of the creature: other texts become empty libraries, so that the wheel is made in seconds
-    "sim_server/backends/cpu/native", "sim_server/recording/", "precond_worker/", "effects/corotational",
-    "effects/rayleigh.cu", "effects/touch.cu", "effects/gravity.cu", "kernels/guess.cu", "kernels/nodes.cu",
-    "kernels/rotate_blocks.cu", "protocol/shared_memory/",
+    "sim_server/backends/cpu/native", "sim_server/recording/", "sim_server/updates/", "precond_worker/",
+    "effects/corotational", "effects/rayleigh.cu", "effects/touch.cu", "effects/gravity.cu", "kernels/guess.cu",
+    "kernels/nodes.cu", "kernels/rotate_blocks.cu", "protocol/shared_memory/",
 )  # fmt: skip
 
 

@@ -5,8 +5,6 @@ import numpy as np
 import pytest
 
 from precond_worker.errors import NotPositiveDefinite
-from precond_worker.factorization import factorize
-from precond_worker.factorization.factorize import open_library
 from precond_worker.factorization.modified_cholesky import ModifiedCholesky
 from precond_worker.factorization.registry import make_factorization
 from precond_worker.symbolic.blocks import node_norms
@@ -110,35 +108,3 @@ def test_a_matrix_that_is_singular_but_for_rounding_is_shifted(library, dtype, l
     error = np.abs(lower @ lower.T - matrix).max() / np.abs(matrix).max()
     assert error < 2 * shift
     assert np.linalg.cond(lower) ** 2 < 100 / shift
-
-
-class Many:
-    """A library that factorizes several matrices together, one after another."""
-
-    most = 3
-
-    def __init__(self, library):
-        self.name, self.pattern, self._library = library.name, library.pattern, library
-
-    def factorize(self, matrix, dtype, out):
-        return self._library.factorize(matrix, dtype, out)
-
-    def begin_many(self, matrices, dtype):
-        made = np.array([self._library.factorize(matrix, dtype, None) for matrix in matrices])
-        return lambda: made
-
-
-def test_factors_that_are_made_together_are_judged_as_each_alone(monkeypatch):
-    """Where a pivot of one of them is rounding error, all are made one by one, with the remedy that it needs."""
-    monkeypatch.setattr(factorize, "open_library", lambda *pattern: Many(open_library(*pattern)))
-    made = ModifiedCholesky(*BAR)
-    matrices = [spd(*BAR, seed=seed) for seed in range(3)]
-    assert made.most == 3
-    found = made.begin_many(matrices)()
-    assert all(map(np.array_equal, found, [made.factorize(matrix) for matrix in matrices]))
-    spoilt = np.zeros_like(matrices[1])
-    spoilt[diagonal_blocks(*BAR)] = np.eye(3)
-    assert made.begin_many([matrices[0], spoilt])() is not None
-    spoilt[diagonal_blocks(*BAR)[3]] = 1 + 1e-12 * np.eye(3)
-    assert made.begin_many([matrices[0], spoilt])() is None
-    assert made.begin_many([matrices[0], matrices[1][:-1]]) is None, "malformed"

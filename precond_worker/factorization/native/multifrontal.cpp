@@ -380,6 +380,20 @@ Result mf_factorize(Multifrontal* w, const double* values, int64_t blocks, int32
     }
 }
 
+// Factorizes matrices as `mf_factorize` does one: in float32 first where L is `narrow`, and in float64 where that has no factor or
+// its smallest pivot is at most `rough`. Values of L of one follow those of the one before, `nonzeros` each; least[i]: smallest
+// pivot (Result), -1 where there is no factor.
+void mf_factorize_many(Multifrontal* w, int64_t count, const double* const* values, int64_t blocks, int32_t narrow, double rough,
+                       char* out, int64_t nonzeros, const Library* single, const Library* wide, double* least) {
+    const int64_t step = nonzeros * (narrow ? sizeof(float) : sizeof(double));
+    for (int64_t i = 0; i < count; ++i, out += step) {
+        Result made = {PIVOT, -1, 0, 0};
+        if (narrow) made = mf_factorize(w, values[i], blocks, 1, 1, out, single);
+        if (made.outcome != MADE || !(made.least > rough)) made = mf_factorize(w, values[i], blocks, 0, narrow, out, wide);
+        least[i] = made.outcome == MADE ? made.least : -1;
+    }
+}
+
 // Writes the values of L |D|^1/2 of A = L D L^T in float64, or float32 if `narrow`; growth (n,): diagonal of L |D| L^T.
 Result mf_signed(Multifrontal* w, const double* values, int32_t narrow, void* out, double* growth, const Library* library) {
     try {

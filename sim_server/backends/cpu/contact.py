@@ -9,12 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim_server.arrays import Float64
-from sim_server.backends.contact import Contact, OwnSurfaces, Surfaces
+from sim_server.backends.contact import MOST_MODES, Contact, OwnSurfaces, Surfaces
 from sim_server.backends.cpu import structs
 from sim_server.backends.state import StateArray, host_array, memory_of, same_body
 from sim_server.backends.ties import Ties
-
-MOST_MODES = 600  # of the coarse space of an island of bodies
 
 
 class NativeContact:

@@ -16,7 +16,9 @@ from sim_server.backends.gpu.cupy_types import DeviceArray, KernelFunction
 from sim_server.backends.gpu.device import Gpu, compiled, options, own_headers
 from sim_server.backends.gpu.energies import node_chunks
 from sim_server.backends.gpu.faces import DEFINED, FaceRows
-from sim_server.backends.gpu.islands import Graphs, IslandPasses, PairsTold
+from sim_server.backends.gpu.host_results import ContactResults
+from sim_server.backends.gpu.island_memory import SharedContact
+from sim_server.backends.gpu.islands import Graphs, IslandPasses
 from sim_server.backends.gpu.solver import PcgSolver
 from sim_server.backends.gpu.state import device_arrays
 from sim_server.backends.gpu.structs import CONTACT_SOLVE, CONTACT_STATE
@@ -62,11 +64,8 @@ class ContactPasses:
     ranges: nodes [first, last) of each body
     arrays: host arrays by name (row_start, columns, values, b, y, x, rotation)
     balance: energy balances of the bodies on the device, which get the work of contact
+    results: memory of the host that the steps write to
     correction: of factors; None: they are not corrected
-    results, reactions: host memory (capacity, bodies) of CONTACT_RESULT and (capacity, bodies, obstacles, 6) that the
-        steps write to
-    broken: likewise (ties,) of int32, steps completed when one broke
-    told: of bodies that touch each other, likewise; None: they do not
 
     Tests run its kernels with what it keeps: grid (thread blocks), params (arguments of the kernels), first and later
     (of the solver, in the first solve of a step and in passes), active (bodies that are not over), memory (arrays by
@@ -75,9 +74,8 @@ class ContactPasses:
 
     def __init__(
         self, gpu: Gpu, device: Graphs, contact: Contact, ranges: Sequence[tuple[int, int]],
-        arrays: Mapping[str, NDArray[Any]], solver: PcgSolver, balance: DeviceArray, results: NDArray[Any],
-        reactions: Float64, broken: Int32, correction: FactorCorrection | None = None,
-        told: PairsTold | None = None,
+        arrays: Mapping[str, NDArray[Any]], solver: PcgSolver, balance: DeviceArray, results: ContactResults,
+        correction: FactorCorrection | None = None,
     ):  # fmt: skip
         cp, nodes, self._bodies = gpu.cp, len(arrays["x"]), len(ranges)
         self._gpu, self._device, self._solver, self.active = gpu, device, solver, cp.zeros(1, np.int32)
@@ -105,13 +103,13 @@ class ContactPasses:
         }  # fmt: skip
         self._table = {n: gpu.twin(a, dtype=a.dtype) for n in TABLE for a in [getattr(contact.obstacles, n)]}
         self.faces = FaceRows(gpu, contact, contact.faces, starts, arrays, real) if contact.faces else None
-        self.params = self._arguments(contact, results, reactions)
+        self.params = self._arguments(contact, results)
         if correction:
             correction.connect(self.memory["pair"], self.memory["base"], self.params)
         self.islands: IslandPasses | None = None
         if contact.surfaces or contact.ties:
-            given = gpu, device, contact, ranges, arrays, solver, self.params, chunks, THREADS, broken, self.faces, told
-            self.islands = IslandPasses(*given)
+            shared = SharedContact(self.params, chunks, THREADS, self.faces)
+            self.islands = IslandPasses(gpu, device, contact, ranges, arrays, solver, shared, results)
         self.first, self.later = self._solve(contact, 1), self._solve(contact, 0)
         module = cp.RawModule(
             code=TEXT.checked(), options=(*options(gpu.types), *own_headers(), *([DEFINED] if self.faces else [])),
@@ -126,7 +124,7 @@ class ContactPasses:
             found += device_arrays("engine.faces", self.faces.memory, "base", "known")
         return found + (self.islands.state() if self.islands else [])
 
-    def _arguments(self, contact: Contact, results: NDArray[Any], reactions: Float64) -> NDArray[Any]:
+    def _arguments(self, contact: Contact, results: ContactResults) -> NDArray[Any]:
         """Returns the arguments of all kernels."""
         params: Any = np.zeros((), CONTACT_ARGUMENTS)
         for name, array in self.memory.items():
@@ -135,10 +133,11 @@ class ContactPasses:
             params["obstacles"][name] = array.data.ptr
         if self.faces:
             self.faces.fill(params["faces"])
-        params["contact_results"], params["reactions"] = results.ctypes.data, reactions.ctypes.data
+        params["contact_results"] = results.solves.ctypes.data
+        params["reactions"], params["capacity"] = results.reactions.ctypes.data, len(results.reactions)
         params["dx_dv"], params["force_coefficient"] = contact.dx_dv, contact.force_coefficient
         params["tolerance"], params["obstacle_count"] = contact.tolerance, len(contact.obstacles.kind)
-        params["count"], params["capacity"], params["passes"] = self._bodies, len(reactions), contact.passes
+        params["count"], params["passes"] = self._bodies, contact.passes
         return params  # type: ignore[no-any-return]
 
     def _solve(self, contact: Contact, first_of_step: int) -> NDArray[Any]:

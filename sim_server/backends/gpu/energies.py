@@ -192,7 +192,9 @@ def start_sums(
 
     starts: (bodies + 1,), first node of each. mass: (n,) [kg]. x, v: (n, 3) [m], [m/s]. gravity: (3,) [m/s2]. dt [s].
     """
-    first = starts[:-1]
-    extent_x, extent_v = (np.maximum.reduceat(each, first) - np.minimum.reduceat(each, first) for each in (x, v))
-    kinetic, potential = (np.add.reduceat(mass * each, first) for each in (0.5 * (v**2).sum(axis=1), -(x @ gravity)))
-    return np.column_stack([kinetic, potential, dt * extent_v.max(axis=1), np.linalg.norm(extent_x, axis=1)])
+    first, axes = starts[:-1], [np.ascontiguousarray(each.T) for each in (x, v)]  # along which NumPy is twice as fast
+    low, high = ([f.reduceat(each, first, axis=1) for each in axes] for f in (np.minimum, np.maximum))
+    extent_x, extent_v = (most - least for most, least in zip(high, low, strict=True))
+    half_square = 0.5 * (axes[1][0] ** 2 + axes[1][1] ** 2 + axes[1][2] ** 2)
+    kinetic, potential = (np.add.reduceat(mass * each, first) for each in (half_square, -(x @ gravity)))
+    return np.column_stack([kinetic, potential, dt * extent_v.max(axis=0), np.linalg.norm(extent_x, axis=0)])

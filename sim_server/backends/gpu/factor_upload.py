@@ -411,7 +411,7 @@ class FactorUpload:
         sources = [self._source(each) for each in given]
         if len(given) == 1 and isinstance(sources[0], DeviceValues):
             return [self._solver.planes_on_device(given[0].pattern, sources[0], self._multiprocessors)]
-        return self._solver.planes_of([(g.pattern, np.asarray(s)) for g, s in zip(given, sources, strict=True)])
+        return self._solver.planes_of([(g.pattern, _on_host(s)) for g, s in zip(given, sources, strict=True)])
 
     def _source(self, given: GivenFactor) -> NDArray[Any] | DeviceValues:
         """Returns values of a factor as its inverse is built from them: large ones are brought to the device first if
@@ -489,6 +489,7 @@ class FactorUpload:
         """Fills in what is made at some places, each in a storage, a new one unless there is one to spare."""
         storages: dict[int, InverseStorage] = {}  # by place
         made_new = iter(self._new_storages(planned.builder, sum(chosen[place].spare is None for place in places)))
+        reserved = False
         for place in places:
             try:
                 storage = chosen[place].spare
@@ -496,11 +497,12 @@ class FactorUpload:
                     storage = next(made_new, None)
                 if storage is None:
                     storage = planned.builder.storage()
-                self._solver.reserve_vectors(chosen[place].body, planned.plan)
+                reserved |= self._solver.reserve_vectors(chosen[place].body, planned.plan)
                 storages[place] = storage
             except Exception as error:
                 made[place] = error
-        self._gpu.cp.cuda.get_current_stream().synchronize()  # new arrays are complete for other streams
+        if reserved:
+            self._gpu.cp.cuda.get_current_stream().synchronize()  # new vectors are complete for other streams
         builder, able, multiprocessors = planned.builder, list(storages), self._multiprocessors
         for k in range(0, len(able), builder.most):
             some = able[k : k + builder.most]
@@ -513,8 +515,8 @@ class FactorUpload:
                 self._apply(builder, inverse, chosen[place])
 
     def _new_storages(self, builder: InverseBuilder, count: int) -> list[InverseStorage]:
-        """Makes storages for several inverses at once; none where they are few, or there is too little memory."""
-        if count < MANY:
+        """Makes storages for several inverses at once; none for one, or where there is too little memory."""
+        if count < 2:
             return []
         try:
             return builder.several_storages(count)
@@ -617,6 +619,10 @@ class FactorUpload:
             log.warning(
                 "object %r: a factor cannot be used on the GPU: %s; it goes on with %s", uploads.name, reason, held
             )
+
+
+def _on_host(values: NDArray[Any] | DeviceValues) -> NDArray[Any]:
+    return values if isinstance(values, np.ndarray) else np.asarray(values)
 
 
 def _tell(waiting: "Future[Applied | None] | None", applied: Applied | None) -> None:

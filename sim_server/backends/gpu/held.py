@@ -10,7 +10,6 @@ from sim_server.arrays import Float64
 from sim_server.backends.declarations import Declarations
 from sim_server.backends.gpu.cupy_types import DeviceArray
 from sim_server.backends.gpu.device import DeviceLaunch, Gpu, compiled, options, own_headers
-from sim_server.backends.gpu.kernel_fusion import DOMAINS
 
 TEXT = Declarations("backends/gpu/held.cu")
 HELD_REACTIONS = TEXT.dtype("HeldReactions")
@@ -41,8 +40,3 @@ class HeldForces:
         for launch in self._launches:
             launch()
         self._report((-(-int(self._params["numbers"]) // THREADS),), (THREADS,), (self._params,))
-
-
-def leading(launches: Sequence[DeviceLaunch]) -> int:
-    """Returns how many launches come first that are of no domain that is fused."""
-    return next((k for k, launch in enumerate(launches) if launch.domain in DOMAINS), len(launches))

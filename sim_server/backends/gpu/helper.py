@@ -8,6 +8,8 @@ each writes into the memory of the other (peer access).
 
 import threading
 import weakref
+from collections.abc import Iterator
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -31,6 +33,10 @@ HELPER = Declarations("backends/gpu/helper.cu")
 HELP, HELPER_ARGUMENTS = HELPER.dtype("Help"), HELPER.dtype("HelperArguments")
 COMMAND_WORDS: int = HELPER.constant("COMMAND_WORDS")
 PCG_BODY = PCG.dtype("PcgBody")
+
+
+_claims = threading.Lock()  # of what follows
+_stepping: set[int] = set()  # devices on which a scene with a helper makes steps
 
 
 class FarInverse:
@@ -92,7 +98,8 @@ class Helper:
         cp = self.cp = gpu.cp
         self.gpu, self.index = gpu, index
         self._first = cp.cuda.Device()
-        connect(cp, int(self._first.id), index)
+        self.first = int(self._first.id)
+        connect(cp, self.first, index)
         self.device = cp.cuda.Device(index)
         with self.device:
             self.stream: Stream = cp.cuda.Stream(non_blocking=True)
@@ -112,6 +119,26 @@ class Helper:
         """Gives a row back."""
         with self._lock:
             self._free.append(row)
+
+    @staticmethod
+    def helped(nodes: Int64, own: NDArray[np.bool_], per_processor: int) -> NDArray[np.bool_]:
+        """Returns which bodies are helped, (bodies,). Raises InputError where none is.
+
+        nodes, own (bodies,): of each body, and whether it has thread blocks of its own
+        per_processor: thread blocks of a multiprocessor
+        """
+        found: NDArray[np.bool_] = (nodes >= LEAST_NODES) & own
+        if per_processor > 1:
+            raise InputError(
+                f"solver.gpus = 2 with {len(nodes)} objects, of which a multiprocessor takes several at a time: "
+                "allowed is 1"
+            )
+        if not found.any():
+            raise InputError(
+                f"solver.gpus = 2: the largest object has {nodes.max()} nodes; two GPUs are for objects of "
+                f"{LEAST_NODES} and more, allowed is 1"
+            )
+        return found
 
     def connect_solver(
         self, nodes: Int64, threads: int, shared: int, ranges: NDArray[Any], initial_range: NDArray[np.int32],
@@ -207,7 +234,7 @@ class Helper:
         """Appends the copies of an inverse that the stream has made."""
         runtime = self.cp.cuda.runtime
         at, size = int(matrix.data.ptr) + CHUNK_BYTES * far.first, CHUNK_BYTES * far.count
-        first, second = int(self._first.id), self.index
+        first, second = self.first, self.index
         if size:
             runtime.memcpyPeerAsync(far.matrix.data.ptr, second, at, first, size, stream.ptr)
         runtime.memcpyPeerAsync(far.scale.data.ptr, second, scale.data.ptr, first, scale.nbytes, stream.ptr)
@@ -230,6 +257,29 @@ class Helper:
         runtime = self.cp.cuda.runtime
         runtime.memcpyAsync(to, values.ctypes.data, values.nbytes, runtime.memcpyHostToDevice, stream.ptr)
         stream.synchronize()
+
+
+def alone(helper: Helper | None) -> AbstractContextManager[None]:
+    """Returns a context for steps with this helper, which waits for nothing. It raises InputError while another
+    scene makes steps with one of the two devices: thread blocks of each could wait for some that find no place."""
+    return nullcontext() if helper is None else _alone((helper.first, helper.index))
+
+
+@contextmanager
+def _alone(devices: tuple[int, int]) -> Iterator[None]:
+    with _claims:
+        if _stepping.intersection(devices):
+            raise InputError(
+                "solver.gpus = 2: another scene of this process makes steps on these GPUs, and the two could wait for "
+                "each other for ever: run one after the other, or each in a process of its own with other GPUs "
+                "(CUDA_VISIBLE_DEVICES)"
+            )
+        _stepping.update(devices)
+    try:
+        yield
+    finally:
+        with _claims:
+            _stepping.difference_update(devices)
 
 
 def connect(cp: Any, first: int, second: int) -> None:

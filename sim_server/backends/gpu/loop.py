@@ -28,6 +28,18 @@ DOUBLED = 512 << 20  # bytes of the matrices of all bodies, up to which each has
 POLL = 1e-5  # interval between queries of an event [s]
 
 
+def places_of_copies(size: int) -> int:
+    """Returns for how many copies of the matrix of each body the loop has page-locked memory. size: bytes of the
+    matrices of all bodies"""
+    return 2 if size <= DOUBLED else 1
+
+
+def bytes_of_copies(blocks: Sequence[float], real: DTypeLike) -> float:
+    """Returns the bytes of that memory. blocks: of 3x3 numbers of type `real` in the matrix of each body"""
+    size = 9 * np.dtype(real).itemsize * sum(blocks)
+    return places_of_copies(int(size)) * size
+
+
 class LoopDevice(Protocol):
     """A GPU as the loop uses it; handles are integers.
 
@@ -102,8 +114,9 @@ class DeviceLoop(Reports):
         self._readbacks, block = (structs.BodyReadback * bodies)(), 9 * np.dtype(real).itemsize
         most = most_blocks or [int(row_start[last] - row_start[first]) for first, last in ranges]
         self._room = [block * count for count in most]  # bytes of the blocks of each body at most
-        self._places = sum(self._room) <= DOUBLED  # two for the copies of each body
-        staged = np.cumsum([0, *((1 + self._places) * room for room in self._room)])
+        places = places_of_copies(sum(self._room))
+        self._doubled = places == 2
+        staged = np.cumsum([0, *(places * room for room in self._room)])
         self._staged_begin = [int(begin) for begin in staged]  # of the first one of each
         for entry, (first, last), own in zip(self._readbacks, ranges, staged, strict=False):
             begin, end = block * int(row_start[first]), block * int(row_start[last])
@@ -115,6 +128,7 @@ class DeviceLoop(Reports):
         self._own_memory: dict[int, Float64] = {}  # by its place
         entries = np.ctypeslib.as_array(self._readbacks)
         self._copied_steps, self._requests = entries["copied_step"], entries["requested"]
+        self._staged_at = entries["staged_begin"]
         loop.driver = c.addressof(device.functions)
         loop.context, loop.stream, loop.copy_stream = device.context, device.stream, device.copies
         loop.mail_slots, loop.mail_slot_count = c.addressof(self._slots), len(mailboxes)
@@ -258,14 +272,18 @@ class DeviceLoop(Reports):
     def copy_memory(self, body: int) -> Float64 | None:
         """Returns page-locked memory that the next copy of a body's matrix is brought to, (blocks, 3, 3), and that the
         one behind it leaves alone; None: where matrices are large, or of another type."""
-        if self._real != np.float64 or not self._places:
+        if self._real != np.float64 or not self._doubled:
             return None
-        begin = self._staged_begin[body]
-        place = begin + self._room[body] if self._readbacks[body].staged_begin == begin else begin
-        if place not in self._own_memory:
+        place = self._other_place(body)
+        if (own := self._own_memory.get(place)) is None:
             memory = self._staging()[place : place + self._room[body]]
-            self._own_memory[place] = memory.view(np.float64).reshape(-1, 3, 3)
-        return self._own_memory[place]
+            own = self._own_memory[place] = memory.view(np.float64).reshape(-1, 3, 3)
+        return own
+
+    def _other_place(self, body: int) -> int:
+        """First byte of the place for a copy that the last one was not brought to: who has that may still read it."""
+        begin = self._staged_begin[body]
+        return begin + self._room[body] if self._staged_at[body] == begin else begin
 
     def prepare_copies(self) -> None:
         """Makes the memory of copies, which is page-locked: while it is made all calls to CUDA wait."""
@@ -283,9 +301,8 @@ class DeviceLoop(Reports):
         self._staging()
         if target is not self.copy_memory(body):
             self._targets[body] = target
-        entry, begin = self._readbacks[body], self._staged_begin[body]
-        if self._places:  # the other one: who has the copy before this one may still read it
-            entry.staged_begin = begin + self._room[body] if entry.staged_begin == begin else begin
+        if self._doubled:
+            self._staged_at[body] = self._other_place(body)
         self._copied_steps[body] = -1
         self._requests[body] = request  # last: from then on the loop copies
         self.loop.requested = 1
@@ -309,7 +326,7 @@ class DeviceLoop(Reports):
     def staged_matrix(self, body: int) -> int:
         """Returns the device address of the copy requested last, once it is complete: the same float64 values
         (blocks, 3, 3), until the next request. 0: there is none."""
-        entry = self._readbacks[body]
-        if not self.loop.staged or entry.copied_step < 0 or self._real != np.float64:
+        staged = self.loop.staged
+        if not staged or self._copied_steps[body] < 0 or self._real != np.float64:
             return 0
-        return int(self.loop.staged) + int(entry.staged_begin)
+        return int(staged) + int(self._staged_at[body])

@@ -31,6 +31,14 @@ def library() -> c.CDLL:
     return compiled
 
 
+@cache
+def _posting() -> Any:
+    """The function that posts mail. It keeps Python's lock, which takes longer to get back than to post."""
+    held = c.PyDLL(library()._name).wf_gpu_post
+    held.restype, held.argtypes = c.c_void_p, [c.c_void_p, c.c_void_p, c.c_void_p]
+    return held
+
+
 class ChangeMailbox:
     """Has the loop copy new contents into arrays on the device, all between the same two batches.
 
@@ -78,6 +86,7 @@ class DeviceMailbox:
 
     def __init__(self, loop: structs.GpuLoop, slot: structs.MailSlot):
         self._loop, self._slot, self.number = loop, slot, 0
+        self._own = c.addressof(loop), c.addressof(slot)
         self._kept: list[Any] = []  # mail in use, then mail posted
         self._leaving: list[tuple[int, Any]] = []  # (steps after whose completion it is out of use, mail)
 
@@ -91,8 +100,9 @@ class DeviceMailbox:
         self.number += 1
         memory = c.create_string_buffer(data, len(data))
         mail = structs.Mail(c.addressof(memory), event, self.number, -1)
-        displaced = library().wf_gpu_post(c.byref(self._loop), c.byref(self._slot), c.addressof(mail))
-        self._leaving = [(step, what) for step, what in self._leaving if step > self._loop.step]
+        displaced = _posting()(*self._own, c.addressof(mail))
+        if self._leaving:
+            self._leaving = [(step, what) for step, what in self._leaving if step > self._loop.step]
         if displaced:
             self._kept.pop()  # never taken; the mail in use stays
         elif len(self._kept) > 1:  # the last one was taken: those before it are out of use after the steps under way
@@ -103,7 +113,7 @@ class DeviceMailbox:
 
     def withdraw(self) -> bool:
         """Takes back mail that was not copied to the device, while the loop stands still; True if there was any."""
-        back = bool(library().wf_gpu_post(c.byref(self._loop), c.byref(self._slot), None))
+        back = bool(_posting()(*self._own, None))
         back = back or bool(self._slot.pending)
         self._slot.pending = None
         if back:

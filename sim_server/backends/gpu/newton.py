@@ -8,7 +8,7 @@ after another, linearizations x (1 + trials) of them, and launches that no body 
 bodies that are done, the kernels of trials begin with a guard (kernel_fusion.PhaseGuard).
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -164,56 +164,70 @@ class NewtonIteration:
         arrays: Mapping[str, NDArray[Any]], phases: NewtonPhases, solver: PcgSolver, results: NDArray[Any],
         readers: Sequence[DeviceLaunch] = (), beside: Prologue | None = None, within: bool = False,
     ):  # fmt: skip
-        cp, nodes, bodies = gpu.cp, len(arrays["x"]), len(ranges)
-        self._gpu, self._device, self._solver, self.rounds = gpu, device, solver, newton.options.rounds
-        self.rounds += solver.errors  # the last trial that is allowed is judged by one solve more
+        self._gpu, self._device, self._solver, self._phases = gpu, device, solver, phases
+        self.rounds = newton.options.rounds + solver.errors  # one solve more judges the last trial that is allowed
         self.loops = device.has_conditions
         if not self.loops:
             newton.options.check_unrolled()
         first_values: DeviceArray = gpu.twin(arrays["values"])
-        self._values: DeviceArray = cp.empty_like(first_values)  # A of later linearizations
+        self._values: DeviceArray = gpu.cp.empty_like(first_values)  # A of later linearizations
         self._bodies: list[DeviceArray | None] = []  # of the items of each kernel
         later = [launch.with_array(first_values, self._values) for launch in again]
         self._forces, self._blocks = self._guarded(newton, later, phases, readers)
-        names = ("row_start", "columns", "values", "b", "y", "x", "v")
-        host = {name: arrays[name] for name in names} | newton.arrays
-        twins = {name: gpu.twin(array) for name, array in host.items()}
         spans = node_ranges(np.array(ranges, np.int64))
-        self._grid, real = len(spans), twins["x"].dtype
-        self._memory = twins | {
-            "ranges": cp.asarray(spans.view(np.int32)),
-            "diagonal": cp.asarray(own_blocks(arrays["row_start"], arrays["columns"])),
-            "body": cp.asarray(np.repeat(np.arange(bodies, dtype=np.int32), [last - first for first, last in ranges])),
-            "partial_sums": cp.zeros(2 * PARTS * len(spans)), "finished_blocks": cp.zeros(bodies, np.uint32),
-            "search": phases.search, "phase": phases.phase, "active": phases.active, "begun": solver.begun,
-            "clocks": solver.clocks, "step": solver.counter, "pool_counter": solver.pool_counter,
-            "results": solver.results,
-            "initial_state": cp.zeros(12 * nodes, real), "increment": cp.zeros(3 * nodes),
-            "direction": cp.zeros(3 * nodes),
-        }  # fmt: skip
+        self._grid = len(spans)
+        self._memory = self._arrays(newton, spans, ranges, arrays)
         self._params = beside.params if beside else np.zeros((), NEWTON_ARGUMENTS)
         self._begins_beside, self._ends_within = beside is not None, within
-        for name, array in self._memory.items():
-            self._params[name] = array.data.ptr
-        self._params["newton_results"], self._params["bodies"] = results.ctypes.data, solver.bodies_device
-        self._params["dx_dv"], self._params["tolerance"] = newton.dx_dv, newton.options.tolerance
-        self._params["linearizations"], self._params["trials"] = newton.options.linearizations, newton.options.trials
-        self._params["nodes"], self._params["count"], self._params["grid"] = nodes, bodies, len(spans)
-        self._params["capacity"] = results.nbytes // NEWTON_RESULT.itemsize // bodies
+        self._set_arguments(newton, len(ranges), len(arrays["x"]), results)
         self._later_params = self._params.copy()
         self._later_params["values"] = self._values.data.ptr
         kinds = {"ERRORS": solver.errors, "BUDGETS": solver.budgets}
         defined = [kind for kind, wanted in kinds.items() if wanted]
-        flags = (*options(gpu.types), *own_headers(), *(f"-D{kind}" for kind in defined))
         self._definitions = "".join(f"#define {kind}\n" for kind in defined)
-        if self.loops:
-            module = device.linked(NEWTON.checked(), "newton.cu", (*flags, "-DLOOPS"))
-        else:
-            module = gpu.cp.RawModule(code=NEWTON.checked(), options=flags, backend="nvrtc")
+        module = self._module(f"-D{kind}" for kind in defined)
         self._begin, self._update_state, self._accept_trial, self._end = (
             compiled("newton.cu", module, name)
             for name in ("begin_newton", "update_state", "accept_trial", "end_newton")
         )
+
+    def _arrays(
+        self, newton: Newton, spans: NDArray[Any], ranges: Sequence[tuple[int, int]], arrays: Mapping[str, NDArray[Any]]
+    ) -> dict[str, DeviceArray]:
+        """Returns what the kernels work with, by names of NewtonArguments. spans: nodes of each thread block"""
+        cp, solver, nodes, bodies = self._gpu.cp, self._solver, len(arrays["x"]), len(ranges)
+        names = ("row_start", "columns", "values", "b", "y", "x", "v")
+        host = {name: arrays[name] for name in names} | newton.arrays
+        twins: dict[str, DeviceArray] = {name: self._gpu.twin(array) for name, array in host.items()}
+        return twins | {
+            "ranges": cp.asarray(spans.view(np.int32)),
+            "diagonal": cp.asarray(own_blocks(arrays["row_start"], arrays["columns"])),
+            "body": cp.asarray(np.repeat(np.arange(bodies, dtype=np.int32), [last - first for first, last in ranges])),
+            "partial_sums": cp.zeros(2 * PARTS * len(spans)), "finished_blocks": cp.zeros(bodies, np.uint32),
+            **self._phases._asdict(), "begun": solver.begun, "clocks": solver.clocks, "step": solver.counter,
+            "pool_counter": solver.pool_counter, "results": solver.results,
+            "initial_state": cp.zeros(12 * nodes, twins["x"].dtype), "increment": cp.zeros(3 * nodes),
+            "direction": cp.zeros(3 * nodes),
+        }  # fmt: skip
+
+    def _set_arguments(self, newton: Newton, bodies: int, nodes: int, results: NDArray[Any]) -> None:
+        """Sets the arguments of the kernels (NewtonArguments). bodies, nodes: numbers of the scene's"""
+        params, given = self._params, newton.options
+        for name, array in self._memory.items():
+            params[name] = array.data.ptr
+        params["newton_results"], params["bodies"] = results.ctypes.data, self._solver.bodies_device
+        params["dx_dv"], params["tolerance"] = newton.dx_dv, given.tolerance
+        params["linearizations"], params["trials"] = given.linearizations, given.trials
+        params["nodes"], params["count"], params["grid"] = nodes, bodies, self._grid
+        params["capacity"] = results.nbytes // NEWTON_RESULT.itemsize // bodies
+
+    def _module(self, definitions: Iterable[str]) -> KernelModule:
+        """Compiles newton.cu, for a loop of the graph where there may be one."""
+        flags = (*options(self._gpu.types), *own_headers(), *definitions)
+        if self.loops:
+            return self._device.linked(NEWTON.checked(), "newton.cu", (*flags, "-DLOOPS"))
+        module: KernelModule = self._gpu.cp.RawModule(code=NEWTON.checked(), options=flags, backend="nvrtc")
+        return module
 
     def _guarded(
         self, newton: Newton, again: Sequence[DeviceLaunch], phases: NewtonPhases, readers: Sequence[DeviceLaunch]

@@ -7,10 +7,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from protocol.located import Located, address
 from sim_server.backends.gpu.device_values import DeviceValues
 
 
-class PinnedArray(np.ndarray):
+class PinnedArray(Located):
     """An array in page-locked memory. Its memory is used again once nothing refers to it."""
 
 
@@ -43,12 +44,11 @@ def runs(arrays: Sequence[NDArray[Any] | DeviceValues]) -> list[tuple[int, int, 
     found: list[tuple[int, int, int]] = []
     begin = 0
     for each in arrays:
-        address = each.address if isinstance(each, DeviceValues) else int(each.__array_interface__["data"][0])
-        size = each.nbytes
-        if found and found[-1][1] + found[-1][2] == address:
+        place, size = each.address if isinstance(each, DeviceValues) else address(each), each.nbytes
+        if found and found[-1][1] + found[-1][2] == place:
             first, source, length = found[-1]
             found[-1] = first, source, length + size
         else:
-            found.append((begin, address, size))
+            found.append((begin, place, size))
         begin += size
     return found

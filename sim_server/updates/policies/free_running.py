@@ -22,7 +22,6 @@ from sim_server.updates.scheduler import (
     overdue_after,
     pick,
 )
-from sim_server.updates.update_table import NONE
 
 if TYPE_CHECKING:
     from sim_server.updates.driver import Driver
@@ -35,6 +34,7 @@ class Async(UpdatePolicy):
     """Matrices of the most urgent bodies go to idle workers, one of a body at a time."""
 
     free = True
+    selects = False  # `wants` leaves bodies out
     goes_ahead = True  # the next matrix of a body is sent while its last factor is checked, if there is room
 
     def __init__(self, driver: Driver, n: int = 0):
@@ -76,15 +76,14 @@ class Async(UpdatePolicy):
             driver.by_name[name].on_reassignment()
             self.on_job_end()
         self._send_copies()
-        table = driver.table
-        count = int(np.count_nonzero(table.in_flight | (table.checked != NONE)))
-        self._on_their_way += FLYING_WEIGHT * (count - self._on_their_way)
+        _, flying, _ = driver.table.counts()
+        self._on_their_way += FLYING_WEIGHT * (flying - self._on_their_way)
 
     def _choose(self) -> None:
         """Requests the matrices of the most urgent bodies."""
         driver, source, solver = self.driver, self.driver.source, self.driver.solver
         # Count the places: idle workers without a copy on the way, and copies to hold in advance
-        step, waiting = driver.engine.step, int(driver.table.copying.sum())
+        step, (waiting, _, failing) = driver.engine.step, driver.table.counts()
         idle = max(min(source.ready(), MAX_REQUESTS) - waiting, 0)
         places = max(idle, self.prefetch.depth - waiting)
         if places <= 0 or step == self._exhausted:
@@ -94,8 +93,9 @@ class Async(UpdatePolicy):
         chosen: list[int] = []
         for ahead in (False, True) if self.goes_ahead else (False,):
             if room := left + places - len(chosen):
-                requests = self._requests(ahead)
-                requests = requests.of(self.wants(requests, step))
+                requests = self._requests(ahead, failing > 0)
+                if self.selects:
+                    requests = requests.of(self.wants(requests, step))
                 chosen += pick(requests, room, solver.update_floor_steps, solver.schedule, overdue)
         chosen = chosen[left:]
         # Request their matrices; in advance only those of bodies that need a factor
@@ -121,14 +121,15 @@ class Async(UpdatePolicy):
         """Takes note that there is a body again whose matrix may be requested."""
         self._exhausted = -1
 
-    def _requests(self, ahead: bool) -> UpdateRequests:
-        """Returns the requests (Driver.requests) of bodies, without those that are better left for a busy worker."""
+    def _requests(self, ahead: bool, failing: bool) -> UpdateRequests:
+        """Returns the requests (Driver.requests) of bodies, without those that are better left for a busy worker.
+        failing: jobs of any body failed since its last factor"""
         requests, source = self.driver.requests(ahead), self.driver.source
         failures = source.consecutive_failures()
         if failures is None:
             return requests
         reserved = source.reserved()
-        if not (reserved or failures or requests.failures.any()):
+        if not (reserved or failures or failing):
             return requests
         names = [self.driver.bodies[body].body.name for body in requests.body.tolist()]
         counted = replace(requests, failures=np.array([failures.get(name, 0) for name in names], np.int64))
@@ -148,7 +149,7 @@ class Async(UpdatePolicy):
                 if now - step > self.prefetch.patience:
                     driver.snapshots.discard(state)
                 continue
-            if (job := driver.make_job(state)) is not None:
+            if (job := driver.make_job(state, step)) is not None:
                 made.append((state, job))
         self.prefetch.on_sent(len(made), time.monotonic())
         if not made:
@@ -176,15 +177,16 @@ class Async(UpdatePolicy):
     def _latencies(self) -> Float64:
         """Returns the steps from matrix to factor of each body; those not known yet are the mean of the others."""
         values = self.driver.table.latency
-        unknown = np.isnan(values)
-        if not unknown.any():
+        if not np.isnan(values.sum()):
             return values
+        unknown = np.isnan(values)
         return np.where(unknown, 1.0 if unknown.all() else values[~unknown].mean(), values)
 
 
 class Adaptive(Async):
     """As Async, but a matrix is sent only once the excess iterations have cost as much as a factorization."""
 
+    selects = True
     goes_ahead = False  # what was lost is lost to the factor that is about to be replaced
 
     def wants(self, requests: UpdateRequests, step: int) -> Flags:

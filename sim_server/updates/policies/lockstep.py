@@ -42,7 +42,7 @@ class Lockstep(UpdatePolicy):
         now = engine.step
         for job in self._saved:
             state = driver.by_name[job.object]
-            state.job.copy = job.values
+            state.job.set_copy(job.values)
             state.on_job(job.step, job.method)
             if self._submit(state, job):
                 self._due[job.object] = job.step

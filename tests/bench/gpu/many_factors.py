@@ -3,8 +3,11 @@
 
 import argparse
 import json
+import os
 import tempfile
+import threading
 import time
+from collections import Counter
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +21,22 @@ from tests.bench.gpu.served import Served
 
 Row = dict[str, Any]
 PATIENCE = 120.0  # s for the first factor
+LEAST = 1.0  # us a factor of a thread that is named
+KEPT = ["body", "step", "factor_step", "iterations", "whole"]  # of records; all of them would fill memory
+
+
+def thread_seconds() -> dict[str, float]:
+    """Processor time [s] of each thread of this process so far, by name; those of one name, as the workers of OpenMP,
+    together. In ticks of the system, 10 ms mostly."""
+    names = {thread.native_id: thread.name for thread in threading.enumerate()}
+    found: Counter[str] = Counter()
+    for task in Path("/proc/self/task").iterdir():
+        try:
+            name, fields = (task / "comm").read_text().strip(), (task / "stat").read_text().rpartition(")")[2].split()
+        except OSError:  # it has ended meanwhile
+            continue
+        found[names.get(int(task.name), name)] += (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+    return found
 
 
 def measure(
@@ -48,19 +67,22 @@ def measure(
             if uses.min() and ready != ready:
                 ready = time.monotonic() - came
         without = int((uses == 0).sum())
-        end, records, count = time.monotonic() + seconds, [], adopted[0]
+        end, records, count, threads = time.monotonic() + seconds, [], adopted[0], thread_seconds()
         while time.monotonic() < end:
             busy = time.thread_time()
             found = driver.pump()
             cpu += time.thread_time() - busy
-            records.append(found)
+            records.append({name: found[name].copy() for name in KEPT})
             time.sleep(ROUND_PERIOD)
         count = adopted[0] - count
-        r = np.concatenate(records)
-    own = r[r["factor_step"] >= 0]
+        spent = {
+            name: 1e6 * (lasted - threads.get(name, 0.0)) / max(count, 1) for name, lasted in thread_seconds().items()
+        }
+        r = {name: np.concatenate([each[name] for each in records]) for name in KEPT}
+    own = {name: column[r["factor_step"] >= 0] for name, column in r.items()}
     age = own["step"] - 1 - own["factor_step"]
     taken_up = len(np.unique(np.stack([own["body"], own["factor_step"]]), axis=1).T) - len(np.unique(own["body"]))
-    steps = len(r) / beams
+    steps = len(r["step"]) / beams
     return {
         "beams": beams, "tets": tets, "worker": worker, "schedule": schedule, "first factor after s": came - begun,
         "all use one after s": ready, "without": without,
@@ -70,6 +92,7 @@ def measure(
         "factor age": float(age.mean()) if len(age) else None,
         "age p99": float(np.percentile(age, 99)) if len(age) else None, "oldest": int(age.max()) if len(age) else None,
         "iterations": float(r["iterations"].mean()),
+        "threads us/factor": {name: round(each, 1) for name, each in sorted(spent.items()) if each >= LEAST},
     }  # fmt: skip
 
 

@@ -9,9 +9,9 @@ from unittest.mock import patch
 
 import numpy as np
 
-from sim_server.backends.gpu.engine import GpuEngine
 from sim_server.backends.gpu.kernel_fusion import fuse
 from sim_server.backends.gpu.newton import NewtonIteration
+from sim_server.backends.gpu.step_sequence import StepSequence
 from tests.bench.gpu.problem import Problem
 from tests.bench.gpu.steps import Beams, Search, rounds
 
@@ -21,13 +21,13 @@ ONE, ALLOWED = Search(1, 1, 1e-6), Search(4, 1, 1e-6)
 @contextmanager
 def forces_twice() -> Iterator[None]:
     """Steps whose first assembly has its kernels over elements and nodes once more, to the same results."""
-    beginning = GpuEngine._beginning
+    beginning = StepSequence._beginning
 
-    def twice(engine: GpuEngine, assemble: Any, *rest: Any, **more: Any) -> Any:
+    def twice(sequence: StepSequence, assemble: Any, *rest: Any, **more: Any) -> Any:
         forces = fuse([launch for launch in assemble if launch.domain != "blocks"])
-        return [*forces, *beginning(engine, assemble, *rest, **more)]
+        return [*forces, *beginning(sequence, assemble, *rest, **more)]
 
-    with patch.object(GpuEngine, "_beginning", twice):
+    with patch.object(StepSequence, "_beginning", twice):
         yield
 
 

@@ -5,7 +5,6 @@ It shows what a server can take in, as a GPU that factorizes many matrices in on
 """
 
 import sys
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -14,6 +13,7 @@ from numpy.typing import NDArray
 from precond_worker import cli
 from precond_worker.factorization import registry
 from precond_worker.factorization.modified_cholesky import ModifiedCholesky
+from precond_worker.many import Begun, Made, Matrices
 from protocol.channels import MOST_JOBS
 from protocol.factor import FactorPattern
 from protocol.method import Method
@@ -23,7 +23,7 @@ from protocol.validate import checksum
 class Remembering:
     """Complete factors; each matrix is factorized once."""
 
-    most = MOST_JOBS
+    most = together = MOST_JOBS
 
     def __init__(self, row_start: Any, columns: Any, method: Method | None = None, library: str = "auto"):
         self._made = ModifiedCholesky(row_start, columns, library)
@@ -47,10 +47,12 @@ class Remembering:
             self._known[key] = np.ascontiguousarray(self._made.factorize(values, dtype)).copy()
         return self._known[key]
 
-    def begin_many(self, matrices: Any, dtype: Any) -> Callable[[], list[NDArray[Any]]]:
+    def begin_many(self, matrices: Matrices, dtype: Any) -> Begun:
         """As a GPU does with matrices of one pattern."""
-        made = [self.factorize(values, dtype) for values in matrices]
-        return lambda: made
+        given = np.empty((len(matrices), 9 * matrices.blocks))
+        matrices.copy_to(given)
+        made = np.stack([self.factorize(each.reshape(-1, 3, 3), dtype) for each in given])
+        return Begun(lambda: Made(made, np.ones(len(made), np.bool_)), beside=True)
 
 
 if __name__ == "__main__":

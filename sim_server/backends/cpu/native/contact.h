@@ -42,14 +42,16 @@ static bool sweep_obstacles(Passes& p) {
     return true;
 }
 
-// Sets those that y still takes into one back; returns the number of nodes that are moved.
-static int hold_back(const Passes& p) {
+// Sets those that y still takes into one back; counts the nodes that are moved in the reports of their bodies.
+static void hold_back(const Passes& p) {
     p.each_entry([&](int64_t k) { p.before[k] = p.y[k]; });
     ObstacleSweep(p).clip();
     for (int k = 0; k < HOLDS && FaceSweep(p).clip(); ++k) ObstacleSweep(p).clip();
-    int moved = 0;
-    p.each_entry([&](int64_t k) { moved += k % 3 == 0 && !std::equal(p.y + k, p.y + k + 3, p.before + k); });
-    return moved;
+    for (int m = 0; m < p.count; ++m) {
+        const Body& body = p.loop.body[p.bodies[m]];
+        for (int64_t k = 3 * (int64_t)body.first; k < 3 * (int64_t)body.last; k += 3)
+            p.c.report[p.bodies[m]].clipped += !std::equal(p.y + k, p.y + k + 3, p.before + k);
+    }
 }
 
 // The step of an island whose rows are detected; of a body alone as without contact where nothing is touched.
@@ -57,10 +59,11 @@ static void solve_island(Loop& loop, int island, bool resumes) {
     Passes p(loop, island);
     const int first = p.bodies[0], set = resumes ? 0 : p.choose_set();
     bool outside = false;  // y was swept and enters nothing
+    int already = 0;  // passes in which nodes were set back that still are
     if (p.count > 1) IslandSolver::make_modes(loop, p.c, p.bodies, p.count);
     if (resumes) {
         p.take_up();
-        p.report.clipped = 0;  // those of the last solve count
+        already = p.report.passes;
         p.leave();
         p.move_points();
         p.solve(false);
@@ -92,11 +95,13 @@ static void solve_island(Loop& loop, int island, bool resumes) {
         if (!outside) p.solve(false);
     }
     if (p.result.status == NOT_FINITE) p.each_entry([&](int64_t k) { p.y[k] = NAN; });  // the kernel `advance` takes the bodies back
-    else if (!outside) p.report.clipped += hold_back(p);
     for (int m = 0; m < p.count; ++m) {
         p.c.result[p.bodies[m]] = p.result;
+        const int clipped = p.report.passes == already ? p.c.report[p.bodies[m]].clipped : 0;  // those of the last solve count
         p.c.report[p.bodies[m]] = p.report;
+        p.c.report[p.bodies[m]].clipped = clipped;
     }
+    if (p.result.status != NOT_FINITE && !outside) hold_back(p);
 }
 
 // Solves islands, those of several bodies first. resumes: only those that a sweep has given rows.

@@ -17,7 +17,9 @@ struct ContactEnd : IslandRows {
         const bool well = result.status != NOT_FINITE;
         for (int m = 0; m < count; ++m) {
             ContactReport& report = c.report[bodies[m]];
+            const int clipped = report.clipped;
             report = this->report;
+            report.clipped = clipped;
             double* reaction = c.reaction + 6 * (int64_t)c.obstacle_count * bodies[m];
             std::fill(reaction, reaction + 6 * c.obstacle_count, 0.0);
         }
@@ -29,7 +31,7 @@ struct ContactEnd : IslandRows {
         for (int m = 0; m < count; ++m) {
             ContactReport& report = c.report[bodies[m]];
             if (!report.contacts && !report.passes) report.residual = NAN;
-            const bool balanced = result.status != CONTACT && !report.clipped;  // else the forces are more than what acted
+            const bool balanced = c.result[bodies[m]].status != CONTACT && !report.clipped;  // else the forces are more than what acted
             if (!balanced && report.work < 0) report.work = 0;
         }
     }

@@ -24,7 +24,7 @@ struct RowState {                 // of a row in the step under way
 struct ContactReport {            // of a body in a step
     int32_t contacts;             // rows that carry force
     int32_t passes;               // solves
-    int32_t clipped;              // nodes held back at an obstacle, beside the law
+    int32_t clipped;              // its nodes held back at an obstacle, beside the law, and places where its island is held apart
     double residual;              // of the system with the law as it is at the end, relative; NaN: nothing was touched
     double work;                  // of contact on the body [J]
 };

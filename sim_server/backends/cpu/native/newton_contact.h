@@ -188,7 +188,7 @@ struct ContactSearch : Passes {
         const bool acts = apply_law(false);
         if (!sweep_obstacles(*this) && (touches() || !acts)) return false;
         if (!lasts && search.status != NOT_FINITE) return true;
-        c.report[bodies[0]].clipped += hold_back(*this);
+        hold_back(*this);
         return false;
     }
 };
@@ -275,7 +275,7 @@ static void search_in_contact(Loop& loop) {
     for (int i = 0; i < c.islands; ++i) {
         Passes p(loop, i);
         p.conclude(true);  // that the law does not hold is known since the sweep
-        for (int m = 0; m < p.count; ++m) loop.newton->search[p.bodies[m]].status = p.result.status;
+        for (int m = 0; m < p.count; ++m) loop.newton->search[p.bodies[m]].status = c.result[p.bodies[m]].status;
         ContactEnd(p, p.result, p.report).finish();
     }
 }

@@ -136,10 +136,12 @@ struct PairDetection {
                is_bound(c.edge[2 * facing + 1], body);
     }
 
-    // Moves nodes so that what y still takes through another body stays in front of it (hold_apart.cuh). Counts the places in the reports
-    // of both bodies. Bodies whose step is made stay.
+    // Moves nodes so that what y still takes through another body stays in front of it (hold_apart.cuh). Counts the places of
+    // both bodies, and reports the most of an island for all of its bodies. Bodies whose step is made stay.
     void hold_back(double* ends, double* y) const {
         static thread_local std::vector<HeldPlace> places;
+        static thread_local std::vector<int> held;
+        held.assign(loop.bodies, 0);
         std::copy(c.near, c.near + loop.bodies, c.was_near);
         for (int k = 0; k < PAIR_HOLDS; ++k) {
             fit();
@@ -154,11 +156,16 @@ struct PairDetection {
             for (const HeldPlace& p : places) {
                 auto moves = [&](int a) { return c.free[p.node[a]] != 0 && !is_made(loop, p.weight[a] > 0 ? p.body : p.other); };
                 if (!hold_apart(motion, c.mass, p, y, moves)) continue;
-                ++c.report[p.body].clipped;
-                if (p.other != p.body) ++c.report[p.other].clipped;
+                ++held[p.body];
+                if (p.other != p.body) ++held[p.other];
                 moved = true;
             }
             if (!moved) break;
+        }
+        for (int island = 0; island < c.islands; ++island) {
+            int most = 0;
+            for (int k = c.island_start[island]; k < c.island_start[island + 1]; ++k) most = std::max(most, held[c.island[k]]);
+            for (int k = c.island_start[island]; k < c.island_start[island + 1]; ++k) c.report[c.island[k]].clipped += most;
         }
         for (int i = 0; i < loop.bodies; ++i) c.near[i] = c.was_near[i] = c.near[i] | c.was_near[i];
     }

@@ -285,18 +285,15 @@ struct Passes : IslandRows {
         return size <= contact_tolerance * given;
     }
 
-    // Goes on with what an earlier solve of the step has come to. An island that grew counts what its first body has, and what was held
-    // back in any of its bodies.
+    // Goes on with what an earlier solve of the step has come to. An island that grew counts what its first body has.
     void take_up() {
         result = c.result[bodies[0]];
         report = c.report[bodies[0]];
-        for (int m = 1; m < count; ++m) report.clipped = std::max(report.clipped, c.report[bodies[m]].clipped);
     }
 
-    // At the end of the step. holds: the law does.
+    // At the end of the step. holds: the law does. What was set back is each body's own.
     void conclude(bool holds) {
         take_up();
-        result.status = status_in_contact(result.status, holds, report.clipped);
-        for (int m = 0; m < count; ++m) c.result[bodies[m]].status = result.status;
+        for (int m = 0; m < count; ++m) c.result[bodies[m]].status = status_in_contact(result.status, holds, c.report[bodies[m]].clipped);
     }
 };

@@ -56,16 +56,9 @@ static void backward_node(const Panel<T>& L, T* x, const int32_t* rows, const T*
     x[1] = x1; x[2] = x2;
 }
 
-// below -= L_below x for the rows under the triangle; `sum` is scratch
+// y -= L_below x for the rows under the triangle; `sum` is scratch
 template <class T>
-static void forward_panel(const Panel<T>& L, T* x, const int32_t* rows, T* y, T* sum) {
-    if (L.columns == 3) return forward_node(L, x, rows, y);
-    for (int k = 0; k < L.columns; ++k) {
-        const T* c = L.column(k);
-        T xk = x[k] / c[k];
-        x[k] = xk;
-        for (int r = k + 1; r < L.columns; ++r) x[r] -= c[r] * xk;
-    }
+static void forward_below(const Panel<T>& L, const T* x, const int32_t* rows, T* y, T* sum) {
     int n = L.columns, h = L.height;
     if (h == n) return;
     int k = 0;
@@ -85,10 +78,21 @@ static void forward_panel(const Panel<T>& L, T* x, const int32_t* rows, T* y, T*
     for (int r = n; r < h; ++r) y[rows[r]] -= sum[r];
 }
 
-// x = L_triangle^-T (x - L_below^T y_below)
 template <class T>
-static void backward_panel(const Panel<T>& L, T* x, const int32_t* rows, const T* y, T* below) {
-    if (L.columns == 3) return backward_node(L, x, rows, y);
+static void forward_panel(const Panel<T>& L, T* x, const int32_t* rows, T* y, T* sum) {
+    if (L.columns == 3) return forward_node(L, x, rows, y);
+    for (int k = 0; k < L.columns; ++k) {
+        const T* c = L.column(k);
+        T xk = x[k] / c[k];
+        x[k] = xk;
+        for (int r = k + 1; r < L.columns; ++r) x[r] -= c[r] * xk;
+    }
+    forward_below(L, x, rows, y, sum);
+}
+
+// x -= L_below^T y_below
+template <class T>
+static void backward_below(const Panel<T>& L, T* x, const int32_t* rows, const T* y, T* below) {
     int n = L.columns, h = L.height;
     for (int r = n; r < h; ++r) below[r] = y[rows[r]];
     int k = 0;
@@ -109,10 +113,17 @@ static void backward_panel(const Panel<T>& L, T* x, const int32_t* rows, const T
         for (int r = n; r < h; ++r) sa += a[r] * below[r];
         x[k] -= sa;
     }
-    for (k = n - 1; k >= 0; --k) {
+}
+
+// x = L_triangle^-T (x - L_below^T y_below)
+template <class T>
+static void backward_panel(const Panel<T>& L, T* x, const int32_t* rows, const T* y, T* below) {
+    if (L.columns == 3) return backward_node(L, x, rows, y);
+    backward_below(L, x, rows, y, below);
+    for (int k = L.columns - 1; k >= 0; --k) {
         const T* c = L.column(k);
         T s = x[k];
-        for (int r = k + 1; r < n; ++r) s -= c[r] * x[r];
+        for (int r = k + 1; r < L.columns; ++r) s -= c[r] * x[r];
         x[k] = s / c[k];
     }
 }

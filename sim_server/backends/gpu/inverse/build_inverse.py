@@ -34,6 +34,7 @@ from sim_server.backends.gpu.inverse.plan import Plan
 from sim_server.backends.gpu.inverse.workspace import workspace
 from sim_server.backends.gpu.pinned import is_pinned, runs
 
+FLOAT32 = np.dtype(np.float32)
 ALIGNMENT = 64  # numbers; 256 bytes, as of what is allocated alone
 HEAD = BUILDS.itemsize  # bytes in front of the values: struct Builds
 COUNTS = (1, 4, 16, MOST_BUILDS)  # of inverses, for which graphs are made
@@ -72,11 +73,18 @@ class PartitionedInverse(NamedTuple):
 
 
 class InverseStorage(NamedTuple):
-    """Device memory for one inverse. matrix: (chunks, 8, 32) float16. scale: (N + 1,) float32. far: of a second GPU."""
+    """Device memory for one inverse. matrix: (chunks, 8, 32) float16. scale: (N + 1,) float32. target: their addresses.
+    far: of a second GPU."""
 
     matrix: DeviceArray
     scale: DeviceArray
+    target: tuple[int, int]
     far: FarInverse | None = None
+
+    @classmethod
+    def of(cls, matrix: DeviceArray, scale: DeviceArray) -> "InverseStorage":
+        """Returns a storage in these arrays."""
+        return cls(matrix, scale, (int(matrix.data.ptr), int(scale.data.ptr)))
 
 
 class InverseBuilder:
@@ -116,7 +124,7 @@ class InverseBuilder:
     def storage(self) -> InverseStorage:
         """Allocates memory for one inverse, set to zero."""
         cp, p = self._gpu.cp, self.plan
-        made = InverseStorage(cp.zeros((p.chunks, ROWS, COLUMNS), np.float16), cp.zeros(p.size + 1, np.float32))
+        made = InverseStorage.of(cp.zeros((p.chunks, ROWS, COLUMNS), np.float16), cp.zeros(p.size + 1, np.float32))
         cp.cuda.get_current_stream().synchronize()  # zero before a build writes, in its own stream
         return made._replace(far=self._helper.storage(p)) if self._helper else made
 
@@ -127,7 +135,7 @@ class InverseBuilder:
         matrices = cp.zeros((count, p.chunks, ROWS, COLUMNS), np.float16)
         scales = cp.zeros((count, pitch), np.float32)[:, : p.size + 1]
         cp.cuda.get_current_stream().synchronize()
-        return [InverseStorage(matrix, scale) for matrix, scale in zip(matrices, scales, strict=True)]
+        return [InverseStorage.of(matrix, scale) for matrix, scale in zip(matrices, scales, strict=True)]
 
     def build(
         self, values: NDArray[np.floating] | DeviceValues, storage: InverseStorage, multiprocessors: int | None = None
@@ -173,12 +181,12 @@ class InverseBuilder:
             space.copied.synchronize()
         head = space.staging[:HEAD].view(BUILDS)[0]
         head["count"] = count
-        targets = [(s.matrix.data.ptr, s.scale.data.ptr) for s in storages]
+        targets = [storage.target for storage in storages]
         head["targets"][:count] = np.array(targets, np.uint64).view(INVERSE_STORAGE).ravel()
         size = HEAD + 4 * count * self._nonzeros
         graph, stream = self._graph(multiprocessors, next(c for c in COUNTS if c >= count)), space.stream
         at, copy, kind = int(space.incoming.data.ptr), cp.cuda.runtime.memcpyAsync, cp.cuda.runtime.memcpyHostToDevice
-        if all(each.dtype == np.float32 and is_pinned(each) for each in values):
+        if all(each.dtype == FLOAT32 and is_pinned(each) for each in values):
             copy(at, space.staging.ctypes.data, HEAD, kind, stream.ptr)
             for begin, source, length in runs(values):
                 copy(at + HEAD + begin, source, length, cp.cuda.runtime.memcpyDefault, stream.ptr)

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from protocol.factor import FactorPattern
+from protocol.located import Located, address
 from protocol.validate import helping_threads
 from sim_server.arrays import Float64
 from sim_server.backends.compiler import native
@@ -42,8 +43,9 @@ def largest_responses(pattern: FactorPattern, values: Sequence[NDArray[np.floati
 
     Takes a few passes over L. From any thread, without Python's lock.
     """
-    numbers = [np.ascontiguousarray(each, np.float32) for each in values]
-    each, found = np.array([one.ctypes.data for one in numbers], np.uintp), np.empty(len(numbers))
+    numbers = [_contiguous(each) for each in values]
+    each = np.array([address(one) for one in numbers], np.uintp)
+    found = np.empty(len(numbers))
     arrays = pattern.super_start, pattern.row_start, pattern.rows, pattern.value_start, each, found
     threads = 1 + min(helping_threads(), len(numbers) // FEW)
     library().largest_responses(
@@ -52,12 +54,18 @@ def largest_responses(pattern: FactorPattern, values: Sequence[NDArray[np.floati
     return found
 
 
+def _contiguous(values: NDArray[np.floating]) -> NDArray[np.float32]:
+    known = isinstance(values, Located) and values.dtype == np.float32 and values.flags.c_contiguous
+    return values if known else np.ascontiguousarray(values, np.float32)
+
+
 def planes_of(factors: Sequence[tuple[FactorPattern, NDArray[np.floating]]]) -> list[int]:
     """Returns the float16 numbers per entry that the inverse of each of some factors needs: 1, or 2 for 22 binary
     digits."""
     planes = [1] * len(factors)
     for pattern in dict.fromkeys(pattern for pattern, _ in factors):
         places = [place for place, (own, _) in enumerate(factors) if own is pattern]
-        for place, response in zip(places, largest_responses(pattern, [factors[k][1] for k in places]), strict=True):
-            planes[place] = 1 if response <= MOST_RESPONSE else 2
+        good = largest_responses(pattern, [factors[k][1] for k in places]) <= MOST_RESPONSE
+        for k in np.flatnonzero(~good).tolist():
+            planes[places[k]] = 2
     return planes

@@ -3,14 +3,15 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from math import prod
+from typing import Any
 
 import numpy as np
 import zenoh
 
 from precond_worker.arrays import Float64
-from precond_worker.batch import Batch, accept_batch
+from precond_worker.jobs.batch import Batch, accept_batch
 from protocol.channels import CHANNELS, check_name, key, name_in
 from protocol.messages_pb2 import Matrix, MatrixBatch
 from protocol.method import Method
@@ -22,7 +23,7 @@ from protocol.validate import array, check_header, check_strings, checksum, pars
 DTYPES = ("float32", "float64")
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)
 class Job:
     """A matrix, or positions, of an object.
 
@@ -67,22 +68,31 @@ class Job:
         return self.alone is not None and self.alone.HasField("device_matrix")
 
     @property
+    def is_plain(self) -> bool:
+        """True if it is a matrix in memory of the host."""
+        return self.alone is None or not (self.positions or self.on_device)
+
+    @property
     def shape(self) -> tuple[int, ...]:
         """Shape of the values."""
-        return (self.message.nodes, 3) if self.positions else (self.message.blocks, 3, 3)
+        return (self.message.nodes, 3) if self.positions else (self.blocks, 3, 3)
 
     def values(self, slots: SlotMap) -> Float64:
         """Returns blocks (blocks, 3, 3) or positions (nodes, 3), in place if in shared memory; raises Refused."""
-        count = prod(self.shape)
-        if self.batch is not None:
-            values = self.batch.matrix(self.place, slots)
-        elif self.shared:
-            values = slots.array(self.message.matrix_slot, np.float64, count)
-        else:
-            values = array(self._copied(), np.float64, (count,), "Matrix payload")
-        if checksum(values) != self.message.checksum:
+        values = self.unchecked(slots)
+        told = self.message.checksum if self.batch is None else self.batch.message.checksums[self.place]
+        if checksum(values) != told:
             raise Refused("Matrix.checksum does not match the values: lost or overwritten", "checksum")
         return values.reshape(self.shape)
+
+    def unchecked(self, slots: SlotMap) -> Float64:
+        """Returns the numbers of `values`, (n,), whatever their checksum is; raises Refused."""
+        count = prod(self.shape)
+        if self.batch is not None:
+            return self.batch.matrix(self.place, slots)
+        if self.shared:
+            return slots.array(self.message.matrix_slot, np.float64, count)
+        return array(self._copied(), np.float64, (count,), "Matrix payload")
 
     def _copied(self) -> bytes:
         data = take(self.payload, CHANNELS["matrix"].bulk, "Matrix payload")
@@ -124,4 +134,10 @@ def _method(message: Matrix | MatrixBatch) -> Method:
     """Returns how factors are to be made; raises Refused."""
     if message.factor_dtype not in DTYPES:
         raise Refused(f"Matrix.factor_dtype is {message.factor_dtype!r}; allowed: {', '.join(DTYPES)}", "malformed")
-    return Method(message.method, message.drop_tolerance, message.fill, message.omega).check()
+    return _checked_method(message.method, message.drop_tolerance, message.fill, message.omega)
+
+
+@lru_cache(16)
+def _checked_method(*fields: Any) -> Method:
+    """Returns one object for all jobs of a method, so that few are compared field by field."""
+    return Method(*fields).check()

@@ -4,7 +4,6 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import compress
 from typing import Any
 
 import numpy as np
@@ -17,6 +16,7 @@ from protocol.channels import CHANNELS, MOST_JOBS
 from protocol.factor import ROOM_ALIGNMENT, FactorPattern
 from protocol.messages_pb2 import FactorBatch, Header, Matrix, MatrixBatch
 from protocol.refused import Refused
+from protocol.shared_memory.copies import Parts
 from protocol.shared_memory.pool import HEADER
 from protocol.shared_memory.view import SlotMap
 from protocol.validate import array, check_header, check_strings, parse, take
@@ -49,27 +49,23 @@ class Batch:
         ends, every = np.cumsum(self.message.known).tolist(), list(self.message.known_patterns)
         return [every[end - count : end] for end, count in zip(ends, self.message.known, strict=True)]
 
-    def matrices(self, places: Sequence[int], slots: SlotMap) -> list[Float64]:
-        """Returns some of the matrices, (blocks, 3, 3), in place if in shared memory. Raises Refused unless all have
-        their checksums."""
+    def values(self, slots: SlotMap) -> Float64:
+        """Returns the values of all matrices one after another, in place if in shared memory; raises Refused."""
         if self.shared:
-            every = slots.array(self.message.matrix_slot, np.float64, int(self.starts[-1]))
-            found = [every[begin:end] for begin, end in self.starts[np.add.outer(places, [0, 1])].tolist()]
-        else:
-            found = [self.matrix(place, slots) for place in places]
-        sums, _ = native_copies().sum_up(found)
-        if sums != [self.message.checksums[place] for place in places]:
-            raise Refused("MatrixBatch.checksums do not match the values: lost or overwritten", "checksum")
-        return [values.reshape(-1, 3, 3) for values in found]
+            return slots.array(self.message.matrix_slot, np.float64, int(self.starts[-1]))
+        return self._copied
+
+    @cached_property
+    def _copied(self) -> Float64:
+        data = take(self.payload, CHANNELS["matrices"].bulk, "MatrixBatch payload")
+        size = 8 * int(self.starts[-1])
+        copied = data[HEADER : HEADER + size]  # a reader without shared memory gets the whole slot
+        return array(copied, np.float64, (size // 8,), "MatrixBatch payload")
 
     def matrix(self, place: int, slots: SlotMap) -> Float64:
         """Returns the values of one of the matrices, in place if in shared memory; raises Refused."""
-        begin, end, all_of_them = (int(n) for n in self.starts[[place, place + 1, -1]])
-        if self.shared:
-            return slots.array(self.message.matrix_slot, np.float64, all_of_them)[begin:end]
-        data = take(self.payload, CHANNELS["matrices"].bulk, "MatrixBatch payload")
-        copied = data[HEADER + 8 * begin : HEADER + 8 * end]  # a reader without shared memory gets the whole slot
-        return array(copied, np.float64, (end - begin,), "MatrixBatch payload")
+        begin, end = self.starts[[place, place + 1]].tolist()
+        return self.values(slots)[begin:end]
 
     def entry(self, place: int) -> Matrix:
         """Returns one of the jobs as it would come alone, without slots."""
@@ -88,7 +84,7 @@ class Batch:
 
 
 def accept_batch(sample: zenoh.Sample, worker: str, incarnation: int) -> Batch:
-    """Checks a sample with several jobs but for the values, which are checked one by one; raises Refused."""
+    """Checks a sample with several jobs but for the values; raises Refused."""
     message = parse(MatrixBatch, sample.attachment, CHANNELS["matrices"].limit)
     check_header(message, incarnation=incarnation)
     check_strings(message, 256)
@@ -127,41 +123,42 @@ class BatchAnswer:
         self._remedies: list[str] = []
 
     def add(
-        self, places: Sequence[int], slots: SlotMap, pattern: FactorPattern, values: Sequence[NDArray[Any]],
+        self, places: Sequence[int], slots: SlotMap, pattern: FactorPattern, values: NDArray[Any], rows: Sequence[int],
         seconds: float, remedy: str = "",
     ) -> list[int]:  # fmt: skip
         """Writes factors of one pattern into their rooms; returns the places of those that are too large for theirs.
-        Raises Refused if this answer is late."""
+        Raises Refused if this answer is late.
+
+        places, rows: of the jobs, and of their factors in `values`, (k, nonzeros)
+        """
         slot, every = self._batch.message.factor_slot, self._batch.rooms
-        rooms = every[np.add.outer(places, [0, 1])].tolist()
-        fits = [each.nbytes <= end - begin for each, (begin, end) in zip(values, rooms, strict=True)]
+        size, where, row = values[0].nbytes, np.array(places), np.array(rows)
+        fits = every[where + 1] - every[where] >= size
         room = slots.array(slot, np.uint8, int(every[-1]))
         if not slots.is_current(slot):
             raise Refused("the slot for factors was lent to somebody else: this answer is late", "late")
-        sources = list(compress(values, fits))
-        targets = [
-            room[begin : begin + each.nbytes] for each, (begin, _) in zip(sources, compress(rooms, fits), strict=True)
-        ]
-        sums, _ = native_copies().copy(sources, targets, own_sources=True)
-        for place, checksum in zip(compress(places, fits), sums, strict=True):
-            self._add(place, pattern.id, pattern.nonzeros, checksum, seconds, "", remedy)
-        return [place for place, fit in zip(places, fits, strict=True) if not fit]
+        written = where[fits]
+        sources, targets = Parts(values, size * row[fits]), Parts(room, every[written])
+        sums = native_copies().copy_parts(sources, targets, np.full(len(written), size), own_sources=True)
+        self._add(written.tolist(), pattern.id, pattern.nonzeros, sums, seconds, "", remedy)
+        return list(where[~fits].tolist())
 
     def add_failure(self, place: int, failure: str) -> None:
         """Adds why a job has no factor."""
-        self._add(place, 0, 0, 0, 0.0, failure, "")
+        self._add([place], 0, 0, [0], 0.0, failure, "")
 
     def _add(
-        self, place: int, pattern: int, nonzeros: int, check: int, seconds: float, failure: str, remedy: str
+        self, places: Sequence[int], pattern: int, nonzeros: int, sums: Sequence[int], seconds: float, failure: str,
+        remedy: str,
     ) -> None:  # fmt: skip
-        m = self.message
-        m.jobs.append(self._batch.message.jobs[place])
-        m.patterns.append(pattern)
-        m.nonzeros.append(nonzeros)
-        m.checksums.append(check)
-        m.seconds.append(seconds)
-        self._failures.append(failure)
-        self._remedies.append(remedy)
+        m, jobs, count = self.message, self._batch.message.jobs, len(places)
+        m.jobs.extend([jobs[place] for place in places])
+        m.patterns.extend([pattern] * count)
+        m.nonzeros.extend([nonzeros] * count)
+        m.checksums.extend(sums)
+        m.seconds.extend([seconds] * count)
+        self._failures += [failure] * count
+        self._remedies += [remedy] * count
 
     def finished(self) -> FactorBatch:
         """Returns the message."""

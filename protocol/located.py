@@ -1,0 +1,31 @@
+# SPDX-License-Identifier: MIT
+"""Arrays that know their address, for what hands many of them to native code: NumPy takes 2 us to tell each."""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+class Located(np.ndarray):
+    """An array with the address of its first number; 0: not noted. Views of it have none, they begin elsewhere."""
+
+    address: int = 0
+
+
+def address(array: NDArray[Any]) -> int:
+    """Returns the address of the first number of an array."""
+    known: int = getattr(array, "address", 0)
+    return known or int(array.__array_interface__["data"][0])
+
+
+def rows(memory: NDArray[Any], counts: list[int]) -> list[NDArray[Any]]:
+    """Cuts memory (n,), contiguous, into arrays of so many numbers, one behind the other."""
+    own, at, begin = memory if isinstance(memory, Located) else memory.view(Located), 0, address(memory)
+    found: list[NDArray[Any]] = []
+    for count in counts:
+        row: Any = own[at : at + count]
+        row.address = begin + at * memory.itemsize
+        found.append(row)
+        at += count
+    return found
