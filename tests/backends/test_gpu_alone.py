@@ -11,7 +11,9 @@ from tests.backends.test_gpu_correction import grabbed, hold
 from tests.scenes import bar, simulation
 
 
-@pytest.fixture(scope="module", params=[(8,), (4,), (4, "LEAN_WORDS", "HALF_WARPS")])  # rows of a warp at a time, and more
+@pytest.fixture(
+    scope="module", params=[(8,), (4,), (4, "LEAN_WORDS", "HALF_WARPS")]
+)  # rows of a warp at a time, and more
 def library(request, tmp_path_factory):
     rows, *more = request.param
     with pytest.MonkeyPatch.context() as patch:
