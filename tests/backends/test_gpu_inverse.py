@@ -98,7 +98,8 @@ static float half_at(unsigned word, int k) {
     std::memcpy(&v, &bits, 2);
     return (float)v;
 }
-// mma.m16n8k16: lane 4 g + t has rows g (a0, a2) and g + 8 (a1, a3) of a, columns 2 t, 2 t + 1 (a0, a1) and 2 t + 8, 2 t + 9 (a2, a3);
+// mma.m16n8k16: lane 4 g + t has rows g (a0, a2) and g + 8 (a1, a3) of a, columns 2 t, 2 t + 1 (a0, a1)
+// and 2 t + 8, 2 t + 9 (a2, a3);
 // of b rows 2 t, 2 t + 1 (b0) and 2 t + 8, 2 t + 9 (b1) of column g; of the sum rows g, g + 8, columns 2 t, 2 t + 1.
 static void matrix_product(float sum[4], unsigned a0, unsigned a1, unsigned a2, unsigned a3, unsigned b0, unsigned b1) {
     const int warp = threadIdx.x / 32, lane = threadIdx.x % 32, g = lane / 4, t = lane % 4;
