@@ -9,6 +9,7 @@ is an older factor.
 """
 
 import json
+import logging
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -27,6 +28,8 @@ from sim_server.scene.messages import NAMED, readable
 from sim_server.scene.obstacles import Obstacle
 from sim_server.scene.parameters import nearest
 from sim_server.scene.regions import Selection
+
+log = logging.getLogger(__name__)
 
 REASONS = {  # why keys cannot change while steps run, by how they begin
     "dt": "the time step is an argument of every kernel and of the clock",
@@ -242,24 +245,32 @@ class LiveParameters:
                 staged = simulation.engine.stage(new)
         except InputError as error:
             raise BadParameter(str(error)) from None
+        update, keys = ParameterUpdate({}, client), {f.key for f in changed}
+        before, withdrawn = (self.scene, self._update, self._waiting, self._first), False
+        try:
+            if withdrawn := simulation.engine.withdraw_changes():
+                assert self._update is not None
+                update.replaces = self._update
+                keys |= self._update.values.keys()
+                if self._first is self._update:
+                    self._first = None
+            else:
+                self._waiting, self._taken = {}, self.scene
+            self._waiting = self._waiting | {id(array): each for (array, _), each in zip(new, staged, strict=True)}
+            self._update, self.scene = update, scene
+            has = {f.key: _plain(f.value) for f in live_fields(self._taken) if f.key in keys}
+            news = [f for f in live_fields(scene) if f.key in keys and _plain(f.value) != has.get(f.key)]
+            if news:
+                self._post(update, news)
+        except Exception:
+            self.scene, self._update, self._waiting, self._first = before
+            if withdrawn:
+                self._post_again()
+            raise
+        if update.replaces is not None:
+            update.replaces.replaces = None  # keep no chain of them
         for effect, found in elastic.items():
             effect.elastic = found
-        update, keys = ParameterUpdate({}, client), {f.key for f in changed}
-        if simulation.engine.withdraw_changes():
-            assert self._update is not None
-            update.replaces = self._update
-            keys |= self._update.values.keys()
-            self._update.replaces = None  # keep no chain of them
-            if self._first is self._update:
-                self._first = None
-        else:
-            self._waiting, self._taken = {}, self.scene
-        self._waiting |= {id(array): each for (array, _), each in zip(new, staged, strict=True)}
-        self._update, self.scene = update, scene
-        has = {f.key: _plain(f.value) for f in live_fields(self._taken) if f.key in keys}
-        news = [f for f in live_fields(scene) if f.key in keys and _plain(f.value) != has.get(f.key)]
-        if news:
-            self._post(update, news)
         for observe in self.on_set:
             observe(update)
 
@@ -273,6 +284,23 @@ class LiveParameters:
         for note in self.before_loop:
             note(update, self.scene)
         update.pending = self._simulation.engine.change([self._waiting[k] for k in dict.fromkeys(follow)])
+
+    def _post_again(self) -> None:
+        """Gives the loop back the update that was withdrawn for one that failed. If that fails, too, its values are
+        taken back: the scene is what the loop has."""
+        assert self._update is not None
+        try:
+            self._update.pending = self._simulation.engine.change(list(self._waiting.values()))
+        except Exception as error:
+            log.debug("parameters that were set cannot be given to the loop again", exc_info=error)
+            none = ParameterUpdate({}, self._update.client, replaces=self._update)
+            if self._first is self._update:
+                self._first = None
+            self.scene, self._waiting, self._update = self._taken, {}, none
+            for effect in self._simulation.effects.values():
+                effect.elastic = effect.elastic_in(self.scene)
+            for observe in self.on_set:
+                observe(none)
 
     def _described(self, field: LiveField) -> LiveParameter:
         low, high, value = field.live.low, field.live.high, _plain(field.value)

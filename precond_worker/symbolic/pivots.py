@@ -18,7 +18,8 @@ SOURCE = Path(__file__).with_suffix(".cpp")
 
 
 @cache
-def _native() -> c.CDLL | None:
+def native() -> c.CDLL | None:
+    """Returns the library; None where it is not to be had."""
     library, p, n = compiled(SOURCE), c.c_void_p, c.c_int64
     if library is not None:
         library.pivot_scales.restype = library.pivots_sound.restype = None
@@ -35,7 +36,7 @@ class PivotCheck:
     """
 
     def __init__(self, pattern: FactorPattern, diagonal_blocks: Int64):
-        self._library = _native()
+        self._library = native()
         nodes = pattern.permutation[::BLOCK] // BLOCK  # in the order of L
         self._blocks = np.ascontiguousarray(diagonal_blocks[nodes], np.int64)
         self._places = np.ascontiguousarray(pattern.diagonal, np.int64)
@@ -43,9 +44,13 @@ class PivotCheck:
         self._nonzeros = pattern.nonzeros
 
     def scales(self, matrices: Float64) -> Float64:
-        """Returns the largest diagonal entry of each node, in the order of L, (k, nodes), of matrices (k, 9 blocks)."""
+        """Returns the largest diagonal entry of each node, in the order of L, (k, nodes), of matrices (k, 9 blocks).
+        Raises ValueError for arrays that native code must not read."""
         count, size = matrices.shape
-        assert matrices.dtype == np.float64 and matrices.flags.c_contiguous and size >= self._least
+        if matrices.dtype != np.float64 or not matrices.flags.c_contiguous or size < self._least:
+            raise ValueError(
+                f"matrices of {size} numbers of {matrices.dtype}; allowed: float64, at least {self._least}"
+            )
         if self._library is None:
             entries = matrices.reshape(count, -1, BLOCK * BLOCK)[:, self._blocks, :: BLOCK + 1]
             return np.ascontiguousarray(np.abs(entries).max(axis=2))
@@ -55,10 +60,13 @@ class PivotCheck:
         return found
 
     def sound(self, values: NDArray[np.floating[Any]], scales: Float64) -> NDArray[np.bool_]:
-        """Returns whether all pivots of each factor, (k, nonzeros), are more than rounding error, (k,)."""
+        """Returns whether all pivots of each factor, (k, nonzeros), are more than rounding error, (k,). Raises as
+        `scales`."""
         count, size, threshold = *values.shape, pivot_threshold(values.dtype)
-        assert values.dtype in (np.float32, np.float64) and values.flags.c_contiguous and size == self._nonzeros
-        assert scales.shape == (count, len(self._blocks)) and scales.flags.c_contiguous
+        if values.dtype not in (np.float32, np.float64) or not values.flags.c_contiguous or size != self._nonzeros:
+            raise ValueError(f"factors of {size} numbers of {values.dtype}; allowed: {self._nonzeros}, contiguous")
+        if scales.shape != (count, len(self._blocks)) or not (scales.dtype == np.float64 and scales.flags.c_contiguous):
+            raise ValueError(f"scales {scales.shape} of {scales.dtype}; allowed: {(count, len(self._blocks))}, float64")
         if self._library is None:
             pivots = values[:, self._places].astype(np.float64).reshape(count, -1, BLOCK) ** 2
             return np.asarray((pivots > threshold * scales[:, :, None]).all(axis=(1, 2)))

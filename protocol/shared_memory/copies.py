@@ -16,8 +16,8 @@ import numpy as np
 import xxhash
 from numpy.typing import NDArray
 
-from protocol.located import address
-from protocol.validate import ALONE, all_finite, checksum, copied, helping_threads
+from protocol.shared_memory.located import address
+from protocol.validate import ALONE, checksum, copied, helping_threads
 
 SOURCE = Path(__file__).with_name("copies.cpp")
 SHARED = ALONE // 2  # bytes from where on threads share the work: a millisecond, of which they take a tenth to start
@@ -47,12 +47,13 @@ class Parts(NamedTuple):
 
     def addresses(self, size: NDArray[np.int64]) -> NDArray[np.uintp]:
         """Returns the addresses of the parts, of `size` bytes each (k,). Raises ValueError unless all lie inside."""
-        assert self.array.flags.c_contiguous and self.begin.shape == size.shape
+        if not self.array.flags.c_contiguous or self.begin.shape != size.shape:
+            raise ValueError(f"{size.shape} sizes of {self.begin.shape} parts of an array, which must be contiguous")
         most = self.array.nbytes
         inside = (size >= 0) & (size <= most) & (self.begin >= 0) & (self.begin <= most - size)  # no sum may overflow
         if not inside.all():
             raise ValueError(f"parts of an array lie outside of its {most} bytes")
-        return (self.array.__array_interface__["data"][0] + self.begin).astype(np.uintp)
+        return (address(self.array) + self.begin).astype(np.uintp)
 
     def split(self, size: NDArray[np.int64]) -> list[NDArray[np.uint8]]:
         """Returns the bytes of each part. Raises as `addresses`."""
@@ -87,8 +88,9 @@ class Copies:
             pairs = zip(sources, targets, strict=True)
             made = [copied(s, t.view(s.dtype), s if own_sources else t.view(s.dtype)) for s, t in pairs]
             return [each[0] for each in made], [each[1] for each in made]
-        assert all(s.nbytes == t.nbytes for s, t in zip(sources, targets, strict=True))
         size, item = _sizes(sources)
+        if any(s.nbytes != t.nbytes or not t.flags.c_contiguous for s, t in zip(sources, targets, strict=True)):
+            raise ValueError("a target is not contiguous, or not of the bytes of its source")
         return self._call(_addresses(sources), _addresses(targets), size, item, own_sources)[:2]
 
     def take(
@@ -102,7 +104,10 @@ class Copies:
         """
         sizes = [each.size for each in sources]
         ends = np.cumsum(sizes, dtype=np.int64)
-        assert memory.dtype == sources[0].dtype and ends[-1] == memory.size and memory.flags.c_contiguous
+        if memory.dtype != sources[0].dtype or ends[-1] != memory.size or not memory.flags.c_contiguous:
+            raise ValueError(f"{memory.size} numbers of {memory.dtype} for {ends[-1]} of {sources[0].dtype}")
+        if len(diagonals) != len(sources):
+            raise ValueError(f"{len(diagonals)} diagonals of {len(sources)} arrays")
         if self._library is None:
             targets = np.split(memory, ends[:-1])
             sums, finite = self.copy(sources, targets)
@@ -111,13 +116,6 @@ class Copies:
         begin = np.array(address(memory) + (ends - sizes) * memory.itemsize, np.uintp)
         size, item = _sizes(sources)
         return self._call(_addresses(sources), begin, size, item, False, diagonals)
-
-    def sum_up(self, arrays: Sequence[NDArray[Any]]) -> tuple[list[int], list[bool]]:
-        """Returns `checksum` and `all_finite` of each array."""
-        if self._library is None:
-            return [checksum(each) for each in arrays], [all_finite(each) for each in arrays]
-        size, item = _sizes(arrays)
-        return self._call(_addresses(arrays), None, size, item, True)[:2]
 
     def copy_parts(
         self, source: Parts, target: Parts, size: NDArray[np.int64], own_sources: bool = False
@@ -144,7 +142,9 @@ class Copies:
         own_sources: bool, diagonals: Sequence[NDArray[np.int64]] = (),
     ) -> tuple[list[int], list[bool], list[bool]]:  # fmt: skip
         """item: bytes of a number; 0: whether all are finite is not looked at, and there are no diagonals."""
-        assert self._library is not None and (item or not diagonals)
+        assert self._library is not None
+        if diagonals and not item:
+            raise ValueError("numbers on diagonals are of no known size")
         count, size = len(begin), np.ascontiguousarray(size, np.int64)
         places = _Places(diagonals) if diagonals else None
         sums, finite, positive = np.empty(count, np.uint64), np.ones(count, np.bool_), np.ones(count, np.bool_)
@@ -158,9 +158,10 @@ class Copies:
 
 
 def _sizes(arrays: Sequence[NDArray[Any]]) -> tuple[NDArray[np.int64], int]:
-    """Returns the bytes of each array of one type, each contiguous, and of one of their numbers."""
+    """Returns the bytes of each array of one type, each contiguous, and of one of their numbers. Raises ValueError."""
     item = arrays[0].itemsize if arrays else 4
-    assert item in (4, 8) and all(each.itemsize == item and each.flags.c_contiguous for each in arrays)
+    if item not in (4, 8) or not all(each.itemsize == item and each.flags.c_contiguous for each in arrays):
+        raise ValueError("arrays are not all contiguous and of numbers of the same 4 or 8 bytes")
     return np.array([each.nbytes for each in arrays], np.int64), item
 
 
@@ -170,7 +171,8 @@ class _Places:
     def __init__(self, each: Sequence[NDArray[np.int64]]):
         known = {id(places): places for places in each}
         self._kept = list(known.values())
-        assert all(places.dtype == np.int64 and places.flags.c_contiguous for places in self._kept)
+        if not all(places.dtype == np.int64 and places.flags.c_contiguous for places in self._kept):
+            raise ValueError("places on a diagonal are not contiguous int64")
         begin = {key: address(places) for key, places in known.items()}
         self.begin = np.array([begin[id(places)] for places in each], np.uintp)
         self.count = np.array([len(places) for places in each], np.int64)

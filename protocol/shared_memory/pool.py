@@ -20,9 +20,9 @@ import zenoh
 from numpy.typing import DTypeLike, NDArray
 from zenoh import shm
 
-from protocol.located import Located, address
 from protocol.messages_pb2 import Slot as SlotMessage
 from protocol.shared_memory import limits as shm_limits
+from protocol.shared_memory.located import Located, address
 
 HEADER = 64  # bytes; keeps the data aligned to a cache line
 CACHE_LINE = shm.AllocAlignment(6)

@@ -91,6 +91,8 @@ class Reports:
     def other_reactions(self) -> NDArray[Any]:
         """What bodies exerted on grabs and on each other, (k,) of REACTION, up to the newest record that was read."""
         head, tail = int(self.loop.other_head), int(self.loop.other_tail)
+        if head == tail:
+            return np.zeros(0, REACTION)
         out = part_of_ring(self._others, tail, head)
         out = out[: np.searchsorted(out["step"], self._reported, "right")]
         self.loop.other_tail = tail + len(out)

@@ -8,6 +8,7 @@ looked at (`SharedMemory.take`).
 
 import logging
 import secrets
+import time
 from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
@@ -15,6 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from protocol.channels import PROTOCOL
+from protocol.counters import Counters
 from protocol.messages_pb2 import DeviceSlot as DeviceSlotMessage
 from protocol.messages_pb2 import Echo, Header
 from protocol.shared_memory.device_probe import DEVICE_HEADER, NUMBER
@@ -23,6 +25,8 @@ from sim_server.backends.shared_memory import SharedMemory
 
 log = logging.getLogger(__name__)
 
+RETRY = 1.0  # s after a failed allocation in which none is tried, doubled with each one in a row
+MAX_DOUBLINGS = 6
 UNIT = 2 << 20  # bytes; allocations are multiples: a driver shares whole pages of this size
 
 
@@ -42,18 +46,26 @@ class DeviceSlot:
 
 class DeviceSlots:
     """Slots to lend, made in a thread when they are wanted first, and used again. For one thread at a time, unless said
-    otherwise; `lend` and `prepare` do not wait for the device."""
+    otherwise; `lend` and `prepare` do not wait for the device.
 
-    def __init__(self, memory: SharedMemory):
-        self.memory = memory
+    counters: of allocations that failed; None: its own
+    """
+
+    def __init__(self, memory: SharedMemory, counters: Counters | None = None):
+        self.memory, self._counters = memory, Counters(log) if counters is None else counters
         self._thread = ThreadPoolExecutor(1, "device slots")
         self._making: dict[Future[DeviceSlot | None], int] = {}  # with their capacities
         self._slots: list[DeviceSlot] = []
         self._lent: set[int] = set()  # ids
-        self._told = False  # of an error of the driver
-        self._probe = self._made(UNIT)
-        if self._probe is not None:
-            self.mark(self._probe, self._probe.generation)
+        self._failed, self._retry_at = 0, 0.0  # allocations in a row; time [s, monotonic] of the next one
+        self._probe: DeviceSlot | None = None
+        try:
+            probe = self._made(UNIT)
+            if probe is not None:
+                self.mark(probe, probe.generation)
+            self._probe = probe
+        except Exception as error:  # of the driver
+            self._on_failure(error)
 
     @property
     def usable(self) -> bool:
@@ -105,7 +117,8 @@ class DeviceSlots:
     def _begin_making(self, whole: int, most: int) -> None:
         """Begins to make a slot of so many bytes, unless as many are being made or the limit is reached."""
         enough = list(self._making.values()).count(whole) >= most
-        if not enough and self.usable and self.bytes + whole <= self.memory.limit:
+        waits = self._failed and time.monotonic() < self._retry_at
+        if not (enough or waits) and self.usable and self.bytes + whole <= self.memory.limit:
             self._making[self._thread.submit(self._made, whole)] = whole
 
     def give_back(self, slot: DeviceSlot, users: int = 1) -> None:
@@ -123,12 +136,19 @@ class DeviceSlots:
             try:
                 slot = future.result()
             except Exception as error:  # of the driver; what would be there travels through shared memory
-                if not self._told:
-                    log.warning("device memory for matrices and factors is not there: %s (told once)", error)
-                self._told = True
+                self._on_failure(error)
                 continue
-            if slot is not None:
-                self._slots.append(slot)
+            if slot is None:
+                self._on_failure("no more is left")
+                continue
+            self._failed = 0
+            self._slots.append(slot)
+
+    def _on_failure(self, error: Exception | str) -> None:
+        """Takes note of an allocation that failed: of memory that is used up, or of a driver that makes no more."""
+        self._retry_at = time.monotonic() + RETRY * 2 ** min(self._failed, MAX_DOUBLINGS)
+        self._failed += 1
+        self._counters.trouble("device_slots", f"device memory for matrices and factors is not there: {error}")
 
     def _made(self, whole: int) -> DeviceSlot | None:
         found = self.memory.allocate(whole)

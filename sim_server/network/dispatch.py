@@ -229,9 +229,12 @@ class Dispatch(FactorSource):
         with self._lock:
             return self._choice.consecutive_failures()
 
-    def factor_failed(self, worker: str, object: str) -> None:
-        """Notes that a factor made by `worker` was rejected, or that solves had to abandon it."""
+    def factor_failed(self, worker: str, object: str, pattern: int | None = None) -> None:
+        """Notes that a factor made by `worker` was rejected, or that solves had to abandon it. pattern: its id, if it
+        was rejected"""
         with self._lock:
+            if pattern is not None:
+                self.decoder.on_rejected(object, pattern)
             self.reliability.on_failure(worker, object, self._clock())
 
     def factor_helped(self, worker: str, object: str) -> None:
@@ -250,7 +253,10 @@ class Dispatch(FactorSource):
                 self._counters.refuse(refusal)
             except Exception as error:  # whatever a message holds, the run goes on
                 self._counters.refuse(self._counters.unexpected(error, f"a message {str(sample.key_expr)[:200]!r}"))
-        self._intake.take_decoded()
+        try:
+            self._intake.take_decoded()
+        except Exception as error:
+            self._counters.refuse(self._counters.unexpected(error, "factors taken in beside the caller"))
         self._sender.give_back_sent()
         self._query_tokens()
         if self._clock() >= self._looked_at + LOOK_PERIOD:  # many jobs are submitted one after another

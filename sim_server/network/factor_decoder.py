@@ -5,13 +5,13 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cache
+from typing import TypeVar
 from weakref import WeakValueDictionary
 
 import numpy as np
 
 from protocol.channels import CHANNELS, MOST_JOBS, name_in
 from protocol.factor import Factor, FactorPattern, check_values
-from protocol.located import rows
 from protocol.messages_pb2 import DeviceSlot as DeviceSlotMessage
 from protocol.messages_pb2 import Factor as FactorMessage
 from protocol.messages_pb2 import FactorBatch, Topology
@@ -19,6 +19,7 @@ from protocol.messages_pb2 import FactorPattern as PatternMessage
 from protocol.messages_pb2 import Slot as SlotMessage
 from protocol.method import COMPLETE
 from protocol.refused import Refused
+from protocol.shared_memory.located import rows
 from protocol.shared_memory.pool import Slot
 from protocol.validate import (
     Sized,
@@ -38,6 +39,8 @@ from sim_server.network.native_copies import native_copies
 from sim_server.scene.size_limits import expected_values
 from sim_server.updates.factor_source import FactorMemory
 
+T = TypeVar("T")
+
 LARGE = 1 << 20  # bytes of a factor for which `memory` is asked
 WORST_FILL = 6  # over that of nested dissection; minimum degree orderings leave about twice as much
 ALWAYS_ALLOWED = 1 << 18  # values, a megabyte: a small matrix may well have a dense factor
@@ -49,12 +52,12 @@ class CompleteFactors:
     """What objects whose matrices have one pattern share.
 
     patterns: of their complete factors, by id
-    largest: values of the largest of these; 0: there was none
+    sizes: values of these factors, by id, without those of which the last one was rejected
     objects: their names
     """
 
     patterns: dict[int, FactorPattern] = field(default_factory=dict)
-    largest: int = 0
+    sizes: dict[int, int] = field(default_factory=dict)
     objects: set[str] = field(default_factory=set)
 
 
@@ -67,7 +70,7 @@ class AnnouncedObject:
     topology: checksum of the pattern of its matrix
     complete: shared with objects of this topology
     patterns: of L, by id
-    largest: number of values of the largest factor so far, by method
+    sizes: likewise as of CompleteFactors, of the last other factors, by method
     """
 
     epoch: int
@@ -76,7 +79,7 @@ class AnnouncedObject:
     topology: int = 0
     complete: CompleteFactors = field(default_factory=CompleteFactors)
     patterns: dict[int, FactorPattern] = field(default_factory=dict)
-    largest: dict[str, int] = field(default_factory=dict)
+    sizes: dict[str, dict[int, int]] = field(default_factory=dict)
 
     def pattern(self, id: int) -> FactorPattern | None:
         """Returns a pattern that a worker has sent for this object, or that a factor of one like it had."""
@@ -93,12 +96,15 @@ class AnnouncedObject:
         return list(dict.fromkeys((*self.patterns, *self.complete.patterns)))
 
     def most_values(self, method: str) -> int:
-        """Number of values of the largest factor by a method so far, also of objects like it; 0: not known. What is not
-        known of complete ones their pattern tells."""
+        """Number of values of the largest of the last factors by a method, also of objects like it; 0: not known. What
+        is not known of complete ones their patterns tell."""
         if method != COMPLETE:
-            return self.largest.get(method, 0)
-        known = max(self.largest.get(method, 0), self.complete.largest)
-        return known or max((pattern.nonzeros for pattern in self.patterns.values()), default=0)
+            return max(self.sizes.get(method, {}).values(), default=0)
+        if known := self.complete.sizes:
+            return max(known.values())
+        if own := self.patterns:
+            return max(pattern.nonzeros for pattern in own.values())
+        return min((pattern.nonzeros for pattern in self.complete.patterns.values()), default=0)
 
 
 class FactorDecoder:
@@ -138,7 +144,7 @@ class FactorDecoder:
         self.objects[header.object] = AnnouncedObject(
             header.epoch, 3 * topology.nodes, len(topology.columns) // 4, shape, complete
         )
-        if not complete.largest:
+        if not complete.patterns:
             self._unsized.add(header.object)
         self._most_blocks = max(known.blocks for known in self.objects.values())
 
@@ -156,7 +162,7 @@ class FactorDecoder:
         if pattern.nonzeros > (most := known.most_allowed):
             raise Refused(
                 f"FactorPattern.nonzeros is {pattern.nonzeros}; allowed for the {known.blocks} blocks of the matrix: "
-                f"at most {most}, {WORST_FILL} times what nested dissection leaves",
+                f"at most {most}, the more of {ALWAYS_ALLOWED} and {WORST_FILL} times what nested dissection leaves",
                 "size",
             )
         while len(known.patterns) >= MAX_PATTERNS:
@@ -300,11 +306,23 @@ class FactorDecoder:
         seconds: float, remedy: str,
     ) -> Factor:  # fmt: skip
         """Returns the factor of values that were checked."""
-        known.largest[job.method] = max(known.largest.get(job.method, 0), pattern.nonzeros)
         self._unsized.discard(job.object)
-        if job.method == COMPLETE and pattern.id not in known.complete.patterns:
+        if job.method != COMPLETE:
+            sizes = known.sizes.get(job.method, {})
+            if pattern.id not in sizes:
+                known.sizes[job.method] = _with_last(sizes, pattern.id, pattern.nonzeros)
+        elif pattern.id not in known.complete.sizes:
             self._share(known.complete, pattern)
         return Factor(job.object, job.epoch, job.step, job.warp, pattern, values, job.worker, seconds, remedy[:200])
+
+    def on_rejected(self, object: str, pattern: int) -> None:
+        """Takes note that a factor of a pattern did not pass the check: until another one comes, no room is made for
+        factors of its size."""
+        if (known := self.objects.get(object)) is None:
+            return
+        for method, sizes in list(known.sizes.items()):  # another thread may add one
+            known.sizes[method] = {id: size for id, size in sizes.items() if id != pattern}
+        known.complete.sizes = {id: size for id, size in known.complete.sizes.items() if id != pattern}
 
     def _known(self, job: InFlightJob) -> AnnouncedObject:
         """Returns what is known of the object of a job. From any thread: to be asked once for each answer, as another
@@ -316,9 +334,9 @@ class FactorDecoder:
 
     def _share(self, complete: CompleteFactors, pattern: FactorPattern) -> None:
         """Has all objects of a topology know the pattern of a complete factor of one of them."""
-        complete.largest = max(complete.largest, pattern.nonzeros)
-        kept = list(complete.patterns.items())[1 - MAX_PATTERNS :]
-        complete.patterns = {**dict(kept), pattern.id: pattern}  # replaced: another thread may read it
+        complete.patterns = _with_last(complete.patterns, pattern.id, pattern)
+        sizes = {**complete.sizes, pattern.id: pattern.nonzeros}
+        complete.sizes = {id: size for id, size in sizes.items() if id in complete.patterns}
         self._unsized = self._unsized - complete.objects
 
     def _from_slot(
@@ -371,6 +389,12 @@ class _AnswerColumns:
             list(message.seconds), list(message.nonzeros), list(message.patterns), list(message.checksums), remedies,
             (slot.segment, slot.offset, slot.generation),
         )  # fmt: skip
+
+
+def _with_last(entries: dict[int, T], id: int, value: T) -> dict[int, T]:
+    """Returns the last entries and this one behind them, MAX_PATTERNS in all. Another thread may read `entries`."""
+    others = [each for each in entries.items() if each[0] != id]
+    return {**dict(others[1 - MAX_PATTERNS :]), id: value}
 
 
 def _slot(job: InFlightJob) -> Slot:

@@ -116,7 +116,7 @@ class FactorIntake:
         on_device = message.HasField("device_slot")
         if not message.failure and (on_device or 4 * message.nonzeros > LARGE):  # copied and checked beside the caller
             self._refuse_second(job)
-            future = self._woken(self._thread.submit(decode))
+            future = self._begun(self._thread, decode)
             self._decoding[job.number] = Decoding(job, future, future.result, message.seconds, _slots_used(message))
             return
         self._take_factor(job, decode, message.failure, message.seconds, _slots_used(message))
@@ -142,8 +142,8 @@ class FactorIntake:
         together = DecodedTogether([job for _, job in good], seconds, message.matrix_shared, duration)
         decode = partial(self._all_decoded, message, good)
         if 4 * sum(message.nonzeros) <= LARGE_MESSAGE:
-            return self._take_together(together, decode())
-        self._together.append((together, self._woken(self._messages.submit(decode))))
+            return self._guarded(together.jobs, partial(self._take_together, together, decode))
+        self._together.append((together, self._begun(self._messages, decode)))
         self._beside.update(job.number for job in together.jobs)
 
     def _matched(self, message: FactorBatch) -> dict[int, tuple[int, InFlightJob]]:
@@ -179,8 +179,13 @@ class FactorIntake:
             refusal = self._counters.unexpected(error, f"factors of {first}{and_more} by worker {message.worker}")
             return [refusal for _ in answers]
 
-    def _woken(self, future: Future[T]) -> Future[T]:
-        """Has who takes in factors woken at the end of a decoding."""
+    def _begun(self, thread: ThreadPoolExecutor, decode: Callable[[], T]) -> Future[T]:
+        """Has a thread decode, and who takes in factors woken at the end."""
+        try:
+            future = thread.submit(decode)
+        except RuntimeError as error:  # "can't start new thread"
+            future = Future()
+            future.set_exception(self._counters.unexpected(error, "factors of workers"))
         future.add_done_callback(lambda _: self.wake())
         return future
 
@@ -202,7 +207,7 @@ class FactorIntake:
             self._slots_for_parts(job),
         )  # fmt: skip
         decode = partial(self._decoded, job, partial(self._book.decoder.decode, message, b"", job, fetch.run))
-        future, by_slot = self._woken(self._fetching.submit(decode)), _slots_used(message, fetch)
+        future, by_slot = self._begun(self._fetching, decode), _slots_used(message, fetch)
         self._decoding[job.number] = Decoding(job, future, future.result, message.seconds, by_slot, fetch=fetch)
         self._fetches.add(job.number)
 
@@ -242,14 +247,29 @@ class FactorIntake:
         while self._together and self._together[0][1].done():
             together, future = self._together.popleft()
             self._beside.difference_update(job.number for job in together.jobs)
-            self._take_together(together, future.result())
+            self._guarded(together.jobs, partial(self._take_together, together, future.result))
         for number in [number for number, each in self._decoding.items() if each.future.done()]:
             each = self._decoding.pop(number)
             self._fetches.discard(number)
-            try:
-                self._end_decoding(each)
-            except Refused as refusal:
-                self._counters.refuse(refusal)
+            self._guarded([each.job], partial(self._end_decoding, each))
+
+    def _guarded(self, jobs: Sequence[InFlightJob], take: Callable[[], None]) -> None:
+        """Takes in the answers to some jobs. Whatever error that ends with, the jobs are over and the run goes on."""
+        try:
+            return take()
+        except Refused as error:
+            refusal = error
+        except Exception as error:
+            and_more = f" and {len(jobs) - 1} more" if len(jobs) > 1 else ""
+            what = f"factor of {jobs[0].object}{and_more} by worker {jobs[0].worker}"
+            refusal = self._counters.unexpected(error, what)
+        self._counters.refuse(refusal)
+        leases = self._book.leases
+        for job in jobs:
+            if leases.by_worker.get(job.worker, {}).get(job.number) is job:
+                if leases.by_object.get(job.object) is job:
+                    self._book.fail(job, f"was refused: {refusal}")
+                leases.finish(job)
 
     def _end_decoding(self, each: Decoding) -> None:
         job, fetch, by_slot = each.job, each.fetch, each.by_slot
@@ -263,26 +283,30 @@ class FactorIntake:
             return self._book.leases.finish(current)
         self._take_factor(current, each.take, "", each.seconds, by_slot)
 
-    def _take_together(self, together: DecodedTogether, results: Sequence[Factor | Refused]) -> None:
+    def _take_together(self, together: DecodedTogether, results: Callable[[], Results]) -> None:
         """Takes the factors of a message that passed all checks, unless their jobs are over, and notes why others did
         not."""
-        leases, taken, seconds = self._book.leases, [], []
-        for job, told, result in zip(together.jobs, together.seconds, results, strict=True):
-            try:
-                current = leases.match_answer(job.number, job.worker, job.epoch)
-                if leases.is_reassigned(current):
-                    leases.finish(current)
-                elif isinstance(result, Refused):
-                    self._take_factor(current, partial(_refuse, result), "", 0.0, (together.matrix_shared, True))
-                else:
-                    taken.append(current)
-                    seconds.append(told)
-                    self.factors.append(result)
-            except Refused as refusal:
-                self._counters.refuse(refusal)
+        leases, taken, seconds, decoded = self._book.leases, [], [], results()
+        try:
+            for job, told, result in zip(together.jobs, together.seconds, decoded, strict=True):
+                try:
+                    current = leases.match_answer(job.number, job.worker, job.epoch)
+                    if leases.is_reassigned(current):
+                        leases.finish(current)
+                    elif isinstance(result, Refused):
+                        self._take_factor(current, partial(_refuse, result), "", 0.0, (together.matrix_shared, True))
+                    else:
+                        taken.append(current)
+                        seconds.append(told)
+                        self.factors.append(result)
+                except Refused as refusal:
+                    self._counters.refuse(refusal)
+            if taken:
+                self._book.timing.record_all(taken[0].worker, [j.object for j in taken], together.duration, seconds)
+        finally:  # their factors will be used
+            if taken:
+                leases.finish_all(taken, seconds)
         if taken:
-            self._book.timing.record_all(taken[0].worker, [job.object for job in taken], together.duration, seconds)
-            leases.finish_all(taken, seconds)
             size = sum(factor.values.nbytes for factor in self.factors[-len(taken) :])
             self._count(taken[0], size, (together.matrix_shared, True), len(taken))
 
@@ -304,7 +328,8 @@ class FactorIntake:
             seconds = told
             book.timing.record(job.worker, job.object, self._duration(job), seconds)
         except Refused as refusal:
-            book.reliability.on_failure(job.worker, job.object, book.clock())
+            if refusal.kind != "unexpected":  # which may well be an error of this process, and last
+                book.reliability.on_failure(job.worker, job.object, book.clock())
             book.fail(job, f"was refused: {refusal}")
             raise
         finally:

@@ -163,7 +163,7 @@ class ServerLink:
     def share_device(self, memory: SharedMemory) -> None:
         """Has matrices and factors stay in device memory where a worker can open it: one on this host, of this user.
         Not without shared memory of the host, by which it is known to be."""
-        slots = DeviceSlots(memory)
+        slots = DeviceSlots(memory, self.counters)
         if self._pool is None or not slots.usable:
             return slots.close()
         self._closing.callback(slots.close)

@@ -2,11 +2,11 @@
 """Refuses scenes that are larger than the server is allowed to hold, before anything of theirs is allocated.
 
 The bytes are an estimate for the CPU: a line in the elements, and for solves with factors the copies of L that a server
-holds at a time. On a GPU the host's part of these is less, and the page-locked copies of matrices come to it. L of a
-body of n nodes is taken for 72 n^(4/3) values: the law of nested dissection in 3D (George, Nested dissection of a
-regular finite element mesh, 1973), with the constant of bars of 1,500 to 1,029,000 tets by METIS, where it is 39 to 76.
-The rest is fitted to the largest resident memory of servers with 1,500 to 202,272 tets, linear corotational, with a
-worker and a log (tests/scene/test_size_limits.py).
+holds at a time. On a GPU the host's part of these is less, and the page-locked copies of matrices come to it, without
+those of spare nodes of splits. L of a body of n nodes is taken for 72 n^(4/3) values: the law of nested dissection in
+3D (George, Nested dissection of a regular finite element mesh, 1973), with the constant of bars of 1,500 to 1,029,000
+tets by METIS, where it is 39 to 76. The rest is fitted to the largest resident memory of servers with 1,500 to 202,272
+tets, linear corotational, with a worker and a log (tests/scene/test_size_limits.py).
 """
 
 import math

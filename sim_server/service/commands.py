@@ -9,6 +9,7 @@ from itertools import islice
 from typing import TYPE_CHECKING
 
 from protocol import messages_pb2 as pb
+from protocol.counters import Counters
 from protocol.push_limits import LONGEST_PUSH
 from sim_server.recording import messages
 from sim_server.service import cuts
@@ -37,16 +38,18 @@ class Commands:
 
     on_interaction: called with every accepted push and grab and the present time [s]
     frozen: returns True for an object that has run away and moves no more
+    counters: of commands that end in an error which no check foresees; None: its own
 
     supervisor: of the local workers; None: the server has none
     """
 
     def __init__(
         self, simulation: Simulation, on_interaction: Callable[[pb.Interaction, float], None],
-        frozen: Callable[[str], bool] = lambda name: False,
+        frozen: Callable[[str], bool] = lambda name: False, counters: Counters | None = None,
     ):  # fmt: skip
         self.simulation, self.engine = simulation, simulation.engine
         self.on_interaction, self.frozen = on_interaction, frozen
+        self.counters = Counters(log) if counters is None else counters
         self.stopping = False
         self.supervisor: Supervisor | None = None
         self._owners: set[str] = set()
@@ -77,7 +80,7 @@ class Commands:
         except ValueError as error:  # BadCommand, BadParameter, TouchError, MoveError and WorkerError
             return pb.Reply(error=str(error))
         except Exception as error:  # whatever a client asks for, the run goes on
-            log.exception("command %s of %s failed", command.verb, command.client)
+            self.counters.refuse(self.counters.unexpected(error, f"command {command.verb} of {command.client}"))
             return pb.Reply(error=f"{FAILED}: {type(error).__name__}: {error}")
 
     def together(self) -> AbstractContextManager[None]:

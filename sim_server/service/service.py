@@ -83,7 +83,8 @@ class Service:
         self.engine.loop.realtime, self.engine.loop.patient = int(realtime), int(not realtime)
         self.driver = Driver(simulation, link.dispatch)
         self._share_device()
-        self.commands = Commands(simulation, self._record_interaction, self._frozen)
+        self.commands = Commands(simulation, self._record_interaction, self._frozen, link.counters)
+        self.driver.counters = link.counters
         self.telemetry = Telemetry(self.driver, link, recorder, not realtime, self.commands)
         self._set_intervals()
         self._wake = Wake()

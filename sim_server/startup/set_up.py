@@ -17,6 +17,7 @@ from sim_server.certificates.in_use import Certificates
 from sim_server.checkpoint.file import Checkpoint, read
 from sim_server.errors import InputError
 from sim_server.network.link import ServerLink
+from sim_server.network.native_copies import compile_ahead
 from sim_server.recording.recorder import Recorder
 from sim_server.recording.rotation import Rotation
 from sim_server.recording.starts import earlier, started
@@ -48,6 +49,7 @@ def set_up(closing: ExitStack, o: Options) -> tuple[Service, Supervisor | None]:
     try:
         checked = check(o)
         ahead("recording/wire.cpp")
+        compile_ahead()
         simulation = Simulation.load(o.scene, o.overrides, o.device, checked.limits)
         link = closing.enter_context(
             ServerLink(o.name, o.listen, o.connect, shared_memory=o.shared_memory, tls=checked.certificates.server)

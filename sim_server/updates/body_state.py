@@ -226,11 +226,6 @@ class BodyUpdateState:
         self.job.on_sent(step)
         on_sent(self._table, [self._index], [step])
 
-    def on_check(self, step: int) -> None:
-        """Takes note that the factor of `step` has come and is checked beside the steps: the next matrix may be sent
-        meanwhile."""
-        on_checks(self._table, [self], [step])
-
     def on_factor(self, factor: Factor, step: int) -> bool:
         """Takes note of a factor that came during `step`; False if a newer one is there already."""
         job = self.job
@@ -311,7 +306,8 @@ def on_sent(table: UpdateTable, rows: Sequence[int], steps: Sequence[int]) -> No
 
 
 def on_checks(table: UpdateTable, states: Sequence[BodyUpdateState], steps: Sequence[int]) -> None:
-    """Takes note that factors of some steps have come, which are checked beside the steps. table: that of the states"""
+    """Takes note that factors of different bodies, of some steps, have come, which are checked beside the steps: their
+    next matrices may be sent meanwhile. table: that of the states"""
     row, made = np.array([state._index for state in states]), np.asarray(steps)
     table.checked[row] = made
     table.in_flight[row] &= table.sent[row] != made

@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from protocol.counters import Counters
 from protocol.factor import Factor
 from protocol.method import Method
 from sim_server.arrays import Float64
@@ -38,6 +39,7 @@ log = logging.getLogger(__name__)
 
 LARGE = 4 << 20  # bytes of a factor whose check takes more than a few milliseconds
 MANY = 8  # factors that came together, whose checks together take more than a few milliseconds
+CHECK_FAILED = "its check failed"  # begins the reason of a factor whose check ended in an error: no fault of its worker
 MAX_CAUSES = 20  # reasons of missing factors that are logged of an object, each once
 
 
@@ -90,6 +92,7 @@ class Driver:
         self.reactions: Float64 = np.zeros((0, 0, 6))
         self.other_reactions: NDArray[Any] = np.zeros(0, REACTION)
         self.readings: Float64 = np.zeros((0, 0))
+        self.counters = Counters(log)  # of errors of checks
         self.wake: Callable[[], None] = lambda: None  # called in another thread when `pump` has something to take up
         self.on_adopt: list[Callable[[Factor], Any]] = []  # called with every factor that the loop is given
         self.on_epoch: list[Callable[[Body, int], None]] = []  # called before the first job of an epoch of a body
@@ -233,9 +236,10 @@ class Driver:
         """
         beside = self.policy.free and not now
         together: list[Factor] = []
+        chosen: set[str] = set()  # objects of these
         for factor in factors:
             state = self.by_name[factor.object]
-            if beside and not self._may_check(state, factor):
+            if beside and (factor.object in chosen or not self._may_check(state, factor)):
                 self._behind.append(factor)  # its job counts as in flight, so that none comes behind it
             elif factor.step <= state.factors.newest or state.frozen:
                 self.snapshots.release(state, factor.step)
@@ -244,6 +248,7 @@ class Driver:
                 self._check_beside([factor])
             else:
                 together.append(factor)
+                chosen.add(factor.object)
         if beside and len(together) >= MANY and together[0].worker != Inline.WORKER:
             self._check_beside(together)
         elif together:
@@ -262,8 +267,12 @@ class Driver:
         held = [self.snapshots.hold(state, factor.step) for state, factor in zip(states, factors, strict=True)]
         checked = [(factor, matrix) for factor, (_, matrix) in zip(factors, held, strict=True)]
         on_checks(self.table, states, [factor.step for factor in factors])
-        applied = self._prepare(factors[0]) if len(factors) == 1 else None
-        reasons = self._checker.submit(self._reject_reasons, checked, applied)
+        reasons: Future[list[str]] = Future()
+        try:
+            applied = self._prepare(factors[0]) if len(factors) == 1 else None
+            reasons = self._checker.submit(self._reject_reasons, checked, applied)
+        except Exception as error:  # "can't start new thread", or of the device
+            reasons.set_result(self._check_failed(error, len(factors)))
         reasons.add_done_callback(lambda _: self.wake())
         self.checks.append(FactorsUnderCheck(factors, [memory for memory, _ in held], reasons))
 
@@ -275,8 +284,13 @@ class Driver:
         try:
             return self.check.reject_reasons(checked, applied)
         except Exception as error:
-            log.debug("the check of factors failed", exc_info=error)
-            return [f"its check failed: {type(error).__name__}: {error}" for _ in checked]
+            return self._check_failed(error, len(checked))
+
+    def _check_failed(self, error: Exception, factors: int) -> list[str]:
+        """Counts an error of the check of some factors; returns why they are not used."""
+        refusal = self.counters.unexpected(error, CHECK_FAILED)
+        self.counters.refuse(refusal)
+        return [str(refusal)] * factors
 
     def _prepare(self, factor: Factor) -> Callable[[], Float64 | None] | None:
         """Has a large factor made ready for use while it is checked, and applied for the check."""
@@ -317,8 +331,10 @@ class Driver:
         good: list[Factor] = []
         for factor, why in zip(factors, reasons, strict=True):
             if why:
-                self.useless_factors.on_rejected(factor)
-                self.fail(factor.object, f"that of {factor.worker} is not used: {why}", refused=True, step=factor.step)
+                bad = not why.startswith(CHECK_FAILED)
+                if bad:
+                    self.useless_factors.on_rejected(factor)
+                self.fail(factor.object, f"that of {factor.worker} is not used: {why}", refused=bad, step=factor.step)
             else:
                 good.append(factor)
         newer = self._on_factors(good)  # others are older than the newest

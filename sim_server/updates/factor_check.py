@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from protocol.factor import Factor, FactorPattern
-from protocol.located import Located, address
+from protocol.shared_memory.located import Located, address
 from sim_server.arrays import Int32
 from sim_server.backends.compiler import native
 from sim_server.backends.cpu import structs

@@ -118,8 +118,9 @@ class FactorSource(Protocol):
         workers apart, and all failures of an object count."""
         return None
 
-    def factor_failed(self, worker: str, object: str) -> None:
-        """Notes that a factor made by `worker` was rejected, or that solves had to abandon it."""
+    def factor_failed(self, worker: str, object: str, pattern: int | None = None) -> None:
+        """Notes that a factor made by `worker` was rejected, or that solves had to abandon it. pattern: its id, if it
+        was rejected"""
         return
 
     def factor_helped(self, worker: str, object: str) -> None:

@@ -19,8 +19,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from protocol.shared_memory.located import address
 from sim_server.scene.solver_options import Rule
-from sim_server.updates.update_table import COLUMNS, TEXT, Flags, UpdateRequests, address, addresses, library
+from sim_server.updates.update_table import COLUMNS, TEXT, Flags, UpdateRequests, addresses, library
 
 RULES: dict[Rule, int] = {"excess": TEXT.enumerators["BY_EXCESS"], "round_robin": TEXT.enumerators["BY_WAITING"]}
 

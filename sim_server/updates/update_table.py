@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from protocol.shared_memory.located import address
 from sim_server.arrays import Float64, Int64
 from sim_server.backends.compiler import native
 from sim_server.backends.declarations import Declarations
@@ -43,7 +44,8 @@ Flags = NDArray[np.bool_]
 
 @dataclass(eq=False)
 class UpdateRequests:
-    """What the scheduler knows of some bodies: arrays with an entry for each, which do not change.
+    """What the scheduler knows of some bodies: arrays with an entry for each. Those of UpdateTable hold until it
+    is asked again.
 
     body: its number
     excess: summed iterations above the floor
@@ -97,12 +99,6 @@ def library() -> Any:
     compiled = native(SOURCE, signatures, stepping=False, lock=True)
     TEXT.check_sizes(compiled)
     return compiled
-
-
-def address(array: NDArray[Any]) -> int:
-    """Of the first entry of an array; `array.ctypes.data` takes ten times as long."""
-    first: int = array.__array_interface__["data"][0]
-    return first
 
 
 def told(records: NDArray[Any]) -> int:

@@ -71,7 +71,7 @@ class UselessFactors:
     def on_rejected(self, factor: Factor) -> None:
         """Takes note that a factor did not pass the check."""
         self._suspects.add(self._driver.by_name[factor.object].body.index)
-        self._source.factor_failed(factor.worker, factor.object)
+        self._source.factor_failed(factor.worker, factor.object, factor.pattern.id)
 
     def observe(self, records: NDArray[Any], told: int) -> None:
         """Takes note of solves. It costs nothing while none of them abandons its factor. told: what the records tell

@@ -47,6 +47,8 @@ class Maker:
         self.storages: list[list[int]] = []
         self.events: list[Event] = []
         self.limits: list[int | None] = []  # multiprocessors of each build
+        self.reserved: set[tuple[int, int]] = set()  # bodies with vectors, and for which plans
+        self.waits: list[int] = []  # builds that were begun before each wait for new vectors
         self.fail: Exception | None = None
         self.thread = ThreadPoolExecutor(1)
         self.fine: set[int] = set()  # values whose inverses need 22 binary digits
@@ -95,7 +97,13 @@ class Maker:
         return [PartitionedInverse(storage, self.events[-1]) for storage in storages]
 
     def reserve_vectors(self, body: int, plan: Any) -> bool:
-        return False
+        new = (body, id(plan)) not in self.reserved
+        self.reserved.add((body, id(plan)))
+        return new
+
+    def wait(self) -> None:
+        """Stands for the default stream's end of work, in which vectors are made."""
+        self.waits.append(len(self.events))
 
     def apply(self, inverse: PartitionedInverse, r: np.ndarray, multiprocessors: int | None = None) -> np.ndarray:
         """In place of a factor the number that it is."""
@@ -121,7 +129,7 @@ def parts(monkeypatch):
     monkeypatch.setattr(module, "no_memory_left", lambda error: isinstance(error, NoMemory))
     scene = FakeScene()
     maker = Maker(scene)
-    stream = SimpleNamespace(synchronize=lambda: None)
+    stream = SimpleNamespace(synchronize=maker.wait)
     gpu = SimpleNamespace(cp=SimpleNamespace(cuda=SimpleNamespace(get_current_stream=lambda: stream)))
     return scene, maker, FactorUpload(gpu, maker, scene.loop, ["beam"], scene.loop.mailboxes[1:2])
 
@@ -533,6 +541,15 @@ def test_a_factor_that_does_not_fit_leaves_what_is_there_and_is_told_once(parts,
     assert used(scene) == [9]
 
 
+def test_a_build_waits_for_vectors_that_are_new_and_only_for_them(parts):
+    scene, maker, upload = parts
+    for value in (5, 7, 9):
+        post(upload, value)
+        upload.settle()
+        scene.loop.run(1)
+    assert len(maker.events) == 3 and maker.waits == [0]
+
+
 def test_other_errors_are_not_hidden(parts):
     _, maker, upload = parts
     maker.fail = RuntimeError("broken")
@@ -546,7 +563,7 @@ def many(parts, monkeypatch):
     scene, maker, _ = parts
     maker.bodies = np.zeros(module.MANY, maker.bodies.dtype)
     boxes = [Mailbox() for _ in maker.bodies]
-    stream = SimpleNamespace(synchronize=lambda: None)
+    stream = SimpleNamespace(synchronize=maker.wait)
     gpu = SimpleNamespace(cp=SimpleNamespace(cuda=SimpleNamespace(get_current_stream=lambda: stream)))
     return maker, FactorUpload(gpu, maker, scene.loop, [f"beam{k}" for k in range(len(boxes))], boxes), boxes
 

@@ -86,6 +86,21 @@ def test_two_scenes_that_make_steps_at_once_are_refused_in_place_of_waiting_for_
     assert first.engine.run(1) == 1
 
 
+def test_a_step_by_halves_keeps_both_gpus_until_its_end():
+    """What is refused has not begun a step."""
+    first, second = (Simulation.load("deploy/scenes/beam.toml", ["solver.gpus=2"], "gpu") for _ in range(2))
+    first.engine.assemble()
+    begun = second.engine.sequence.counter.get().tolist()
+    with pytest.raises(InputError, match=r"solver.gpus = 2: another scene of this process makes steps on these"):
+        second.engine.assemble()
+    assert second.engine.step == 0 and second.engine.sequence.counter.get().tolist() == begun
+    first.engine.assemble()  # again, as after an error
+    first.engine.solve()
+    second.engine.assemble()
+    second.engine.solve()
+    assert second.engine.step == first.engine.step == 1
+
+
 def test_small_bodies_are_refused(monkeypatch):
     monkeypatch.setattr(helper, "LEAST_NODES", 100_000)
     with pytest.raises(InputError, match=r"solver.gpus = 2: the largest object has \d+ nodes.* allowed is 1"):

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from sim_server.backends.gpu.cuda import CudaDevice
-from sim_server.backends.gpu.engine import FEW
+from sim_server.backends.gpu.step_graphs import FEW
 from sim_server.errors import DeviceError, InputError
 from sim_server.scene.integrator_options import MAX_STATES
 from sim_server.simulation import Simulation

@@ -14,13 +14,13 @@ from typing import Any
 
 ROOT = Path(__file__).resolve().parents[2]
 UNKNOWN = ("age", "next factor")  # may be unknown in any bench
-UNKNOWN_IN = {  # of other steps; without a goal; of a step not ours; without CHOLMOD; without energy, or an estimate
+UNKNOWN_IN = {  # of other steps; without a goal; of steps not ours; without CHOLMOD, energy or GPU; not before the end
     "accuracy": ("step error", "solve error"), "contact": ("goal ms", "loop ms"),
     "cpu": ("iterations", "residual", "wall"), "factors": ("of CHOLMOD",), "rosenbrock": ("energy", "estimate"),
-    "speed": ("in use", "at most", "oldest"),
+    "scale": ("back to", "GPU"), "speed": ("in use", "at most", "oldest"),
 }  # fmt: skip
 TIME = float(os.environ.get("PYTEST_TIMEOUT", 120)) - 10  # s, less than the test may take
-WITHOUT_PICTURE = ("faults", "gallery", "service", "speed")
+WITHOUT_PICTURE = ("attacks", "faults", "gallery", "service", "speed")
 
 
 def bench(name: str, out: Path, *arguments: str) -> dict[str, Any]:

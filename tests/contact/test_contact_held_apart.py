@@ -69,6 +69,18 @@ def test_a_step_that_sets_nodes_back_has_not_converged(what):
     assert set(moved["status"]) == {STATUS["CONTACT"]}
 
 
+def test_a_body_that_touches_nothing_any_more_has_no_nodes_set_back():
+    sim = over(velocity=(0, -6, 0), at=(0, 2 * D, 0), solver=JACOBI, contact={**SOFT, "passes": 1, "tolerance": 0.9})
+    sim.engine.run(1)
+    record = sim.engine.records()[0]
+    assert record["clipped"] > 0 and record["status"] == STATUS["CONTACT"]
+    put(sim, sim.world.v, 0)
+    put(sim, sim.world.x, sim.world.x + np.array((0, 1, 0)))
+    sim.engine.run(1)
+    record = sim.engine.records()[0]
+    assert record["passes"] == 0 and record["clipped"] == 0 and record["status"] == STATUS["CONVERGED"]
+
+
 def test_objects_that_begin_inside_each_other_are_told_with_the_depth(caplog):
     objects = [block(name="one", at=(0, 0, 0)), block(name="other", at=(0.01, 0.05, 0.01))]
     with caplog.at_level(logging.WARNING):

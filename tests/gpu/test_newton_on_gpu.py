@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from protocol.messages_pb2 import SolveStatus
 from sim_server.backends.gpu.cuda import CudaDevice
-from sim_server.backends.gpu.engine import FEW
+from sim_server.backends.gpu.step_graphs import FEW
 from sim_server.errors import InputError
 from sim_server.scene import Scene
 from sim_server.simulation import Simulation

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Slots of device memory: lent once at a time, each in a generation of its own, never more than may be."""
 
+import logging
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -8,8 +9,10 @@ from collections.abc import Callable, Iterator
 import pytest
 
 from protocol.channels import PROTOCOL
+from protocol.counters import Counters
 from protocol.messages_pb2 import Echo, Header
 from sim_server.backends.shared_memory import Allocation
+from sim_server.network import device_slots
 from sim_server.network.device_slots import UNIT, DeviceSlot, DeviceSlots
 from tests.support.device_memory import StandInMemory
 
@@ -83,7 +86,10 @@ def test_no_more_than_may_be_lent_and_none_far_too_large(memory: Gated) -> None:
     assert sum(memory.asked[1:]) <= memory.limit
 
 
-def test_an_error_of_the_driver_costs_one_slot(memory: Gated, caplog: pytest.LogCaptureFixture) -> None:
+def test_an_error_of_the_driver_costs_one_slot(
+    memory: Gated, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(device_slots, "RETRY", 0.0)
     slots, allocate = DeviceSlots(memory), memory.allocate
 
     def broken(size: int) -> Allocation | None:
@@ -93,6 +99,34 @@ def test_an_error_of_the_driver_costs_one_slot(memory: Gated, caplog: pytest.Log
     memory.allocate = broken  # type: ignore[method-assign]
     soon(lambda: slots.lend([MIB]))
     assert "device memory for matrices and factors is not there: cudaErrorUnknown" in caplog.text
+
+
+@pytest.mark.parametrize("raises", [True, False])
+def test_after_a_failed_allocation_none_is_tried_for_a_while(
+    memory: Gated, monkeypatch: pytest.MonkeyPatch, raises: bool
+) -> None:
+    monkeypatch.setattr(device_slots, "RETRY", 1e6)
+    slots, tried = DeviceSlots(memory, counters := Counters(logging.getLogger("test"))), list[int]()
+
+    def broken(size: int) -> Allocation | None:
+        tried.append(size)
+        if raises:
+            raise RuntimeError("cudaErrorMemoryAllocation")
+        return None
+
+    memory.allocate = broken  # type: ignore[method-assign]
+    soon(lambda: [] if slots.lend([MIB]) is None and counters.device_slots else None)
+    for _ in range(20):
+        assert slots.lend([MIB]) is None and not slots.makes_any
+    assert len(tried) == counters.device_slots == 1
+
+
+def test_a_driver_that_fails_at_the_first_allocation_lends_none(memory: Gated) -> None:
+    def broken(size: int) -> Allocation | None:
+        raise RuntimeError("cudaErrorUnknown")
+
+    memory.allocate = broken  # type: ignore[method-assign]
+    assert not DeviceSlots(memory).usable
 
 
 def test_a_server_that_can_share_none_lends_none(memory: Gated) -> None:

@@ -9,10 +9,12 @@ import pytest
 from precond_worker.factorization.factorize import Analysis
 from protocol.channels import PROTOCOL, key
 from protocol.factor import FactorPattern
-from protocol.messages_pb2 import Header, Topology
+from protocol.messages_pb2 import Factor, Header, Topology
 from protocol.refused import Refused
+from protocol.validate import checksum
 from sim_server.network import factor_decoder as module
 from sim_server.network.factor_decoder import FactorDecoder
+from sim_server.network.leases import InFlightJob
 from sim_server.scene.size_limits import expected_values
 from tests.scenes import simulation
 
@@ -88,3 +90,40 @@ def test_a_small_body_may_have_a_dense_factor(stage) -> None:
     assert full.nonzeros < module.ALWAYS_ALLOWED
     send(decoder, header, full)
     assert decoder.objects["body"].most_values("cholesky") == full.nonzeros
+
+
+def test_one_whose_factor_is_rejected_sets_no_slot_from_then_on(stage) -> None:
+    """Of others neither, which share its topology."""
+    decoder, header, _ = stage
+    row_start, columns = graph((3, 3, 20))
+    names, size = ("body", "other"), 3 * (len(row_start) - 1)
+    for name in names:
+        told = Header(protocol=PROTOCOL, incarnation=7, object=name, epoch=2)
+        decoder.announce(
+            Topology(header=told, nodes=size // 3, row_start=row_start.tobytes(), columns=columns.tobytes())
+        )
+    header.epoch = 2
+    honest, full = Analysis(row_start, columns).pattern, dense(size)
+
+    def answer(pattern: FactorPattern) -> None:
+        send(decoder, header, pattern)
+        values = np.ones(pattern.nonzeros, np.float32)
+        message = Factor(
+            header=header, step=5, warp=True, dtype="float32", pattern=pattern.id, nonzeros=pattern.nonzeros,
+            worker="w", job=1, checksum=checksum(values),
+        )  # fmt: skip
+        decoder.decode(message, values.tobytes(), InFlightJob(1, "body", 2, 5, True, "float32", "w", 9.0))
+
+    def most() -> list[int]:
+        return [decoder.objects[name].most_values("cholesky") for name in names]
+
+    answer(honest)
+    assert most() == [honest.nonzeros] * 2
+    answer(full)
+    assert most() == [full.nonzeros] * 2 and full.nonzeros > 2 * honest.nonzeros
+    decoder.on_rejected("body", full.id)
+    assert most() == [honest.nonzeros] * 2
+    decoder.on_rejected("body", honest.id)  # an honest one that is of no use
+    assert most()[1] == honest.nonzeros
+    answer(honest)
+    assert most() == [honest.nonzeros] * 2

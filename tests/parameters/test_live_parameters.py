@@ -213,3 +213,35 @@ def test_viewers_are_told_of_the_new_modulus():
     sim.parameters.set({"bar.corotational.young": "7e4", "bar.corotational.poisson": "0.1"})
     young, poisson = sim.effects["corotational"].elastic[0]
     assert (young == 7e4).all() and (poisson == 0.1).all()
+
+
+@pytest.mark.parametrize("lasts", [False, True], ids=["once", "lasting"])
+def test_an_error_that_no_check_foresees_leaves_scene_and_loop_alike(monkeypatch, lasts):
+    sim, seen = simulation(bar(young=1e5, fixed="X < 0.01"), dt=0.02), []
+    parameters, engine, change = sim.parameters, sim.engine, sim.engine.change
+    sim.engine.run(1)
+    parameters.on_set.append(seen.append)
+    parameters.set({"bar.corotational.young": "3e5"})
+    left = [10**9 if lasts else 1]
+
+    def broken(changes):
+        left[0] -= 1
+        if left[0] >= 0:
+            raise MemoryError("pinned")
+        return change(changes)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(engine, "change", broken)
+        with pytest.raises(MemoryError):
+            parameters.set({"bar.corotational.poisson": "0.1"})
+    engine.run(1)
+    young = 1e5 if lasts else 3e5
+    assert {p.field.key.rpartition(".")[2]: p.field.value for p in parameters} == {"young": young, "poisson": 0.3}
+    assert [not update.values for update in seen] == ([False, True] if lasts else [False])
+    assert parameters.known_to_workers == lasts and (lasts or seen[0].taken == 1)
+    for array in sim.world.live_arrays:
+        assert np.array_equal(array.array, array.compute(parameters.scene))
+    parameters.set({"bar.corotational.young": "2e5"})
+    engine.run(1)
+    for array in sim.world.live_arrays:
+        assert np.array_equal(array.array, array.compute(parameters.scene))

@@ -35,7 +35,7 @@ def test_copies_have_the_checksums_of_their_values(made, dtype):
     sources = arrays(dtype)
     targets = [np.full_like(each, np.nan) for each in sources]
     sums, finite = made.copy(sources, targets)
-    assert sums == [checksum(each) for each in sources] == made.sum_up(sources)[0]
+    assert sums == [checksum(each) for each in sources]
     assert finite == [True] * len(sources)
     for source, target in zip(sources, targets, strict=True):
         np.testing.assert_array_equal(target, source)
@@ -49,7 +49,6 @@ def test_numbers_that_are_not_finite_are_found_in_their_array_alone(made, dtype,
     sources[5][:4] = np.finfo(dtype).max, -np.finfo(dtype).max, np.finfo(dtype).tiny, 0.0
     expected = [k not in (3, 6) for k in range(len(sources))]
     assert made.copy(sources, [np.empty_like(each) for each in sources])[1] == expected
-    assert made.sum_up(sources)[1] == expected
 
 
 def test_what_others_write_to_the_targets_changes_no_checksum(made):
@@ -77,7 +76,7 @@ def test_they_are_taken_in_one_behind_the_other_and_what_is_not_positive_is_foun
 
 def test_memory_of_another_size_or_type_is_a_mistake_of_the_caller(made):
     for memory in (np.zeros(5), np.zeros(3), np.zeros(4, np.float32), np.zeros(8)[::2]):
-        with pytest.raises((AssertionError, ValueError)):
+        with pytest.raises(ValueError):
             made.take([np.zeros(4)], memory, [np.array([0])])
 
 
@@ -93,7 +92,7 @@ NO_THREADS = """
 import ctypes, resource, sys
 import numpy as np
 from protocol.shared_memory import copies as module
-from protocol.validate import ALONE
+from protocol.validate import ALONE, checksum
 
 module.helping_threads = lambda: 3
 made = module.Copies(ctypes.CDLL(sys.argv[1]))
@@ -105,7 +104,7 @@ before = resource.getrlimit(resource.RLIMIT_AS)
 resource.setrlimit(resource.RLIMIT_AS, (taken + (1 << 20), before[1]))  # less than a stack
 sums, finite = made.copy(sources, targets)
 resource.setrlimit(resource.RLIMIT_AS, before)
-print(all(np.array_equal(s, t) for s, t in zip(sources, targets)), sums == made.sum_up(targets)[0], all(finite))
+print(all(np.array_equal(s, t) for s, t in zip(sources, targets)), sums == [checksum(t) for t in targets], all(finite))
 """
 
 
@@ -117,7 +116,7 @@ def test_where_the_system_gives_no_more_threads_one_copies_all():
 
 
 def test_sizes_that_differ_are_a_mistake_of_the_caller(made):
-    with pytest.raises((AssertionError, ValueError)):
+    with pytest.raises(ValueError):
         made.copy([np.zeros(4)], [np.zeros(3)])
 
 

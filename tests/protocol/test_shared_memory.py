@@ -113,6 +113,18 @@ def test_who_does_not_wait_is_told_that_none_can_be_made(pool: SlotPool, monkeyp
     assert pool.lend(size, beside=True) is None and pool.is_making(size), "and tried again"
 
 
+def test_a_slot_that_the_system_does_not_map_is_none(pool: SlotPool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Arrays travel as bytes then; the next call tries again."""
+
+    def refused(*arguments: object) -> None:
+        raise OSError("cannot allocate memory")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(module.mmap, "mmap", refused)
+        assert pool.lend(100_000) is None
+    assert pool.lend(100_000) is not None and pool.lent == 1
+
+
 def test_a_slot_given_back_twice_is_lent_once(pool: SlotPool) -> None:
     slot = pool.lend(100_000)
     assert slot is not None

@@ -72,6 +72,12 @@ def test_an_error_that_no_check_foresees_is_told_and_the_run_goes_on(
 
     monkeypatch.setattr(commands.simulation.touch, "push", broken)
     assert push(commands).error == "it failed: KeyError: 'nose'"
-    assert "command push of anna failed" in caplog.text
+    for _ in range(9):
+        push(commands)
+    (told,) = caplog.records
+    assert (
+        "command push of anna: KeyError: 'nose' (test_service_commands.py:" in told.getMessage() and not told.exc_info
+    )
+    assert commands.counters.refusals == {"unexpected": 10}
     monkeypatch.undo()
     assert push(commands).error == ""

@@ -31,6 +31,20 @@ class Memory:
         self.size, self.nbytes, self.data = values.size, values.nbytes, SimpleNamespace(ptr=values.ctypes.data)
 
 
+class Stream:
+    """A stream that has always done all. end_capture: returns the graph"""
+
+    ptr = 1
+
+    def __init__(self, end_capture: Callable[[], Any]):
+        self.end_capture = end_capture
+
+    def begin_capture(self) -> None: ...
+    def synchronize(self) -> None: ...
+    def __enter__(self) -> None: ...
+    def __exit__(self, *error: object) -> None: ...
+
+
 class WorkerGpu:
     """Stands for the module cupy. launch: called for each launch of the graph of a factorization"""
 
@@ -43,7 +57,8 @@ class WorkerGpu:
             CUDARuntimeError=type("CUDARuntimeError", (Exception,), {}),
         )  # fmt: skip
         self.cuda = SimpleNamespace(
-            runtime=runtime, Stream=lambda **_: self._stream(), memory=SimpleNamespace(OutOfMemoryError=MemoryError),
+            runtime=runtime, Stream=lambda **_: Stream(self._graph),
+            memory=SimpleNamespace(OutOfMemoryError=MemoryError),
             Device=lambda: SimpleNamespace(synchronize=lambda: None), alloc_pinned_memory=self.pinned,
         )  # fmt: skip
         self.get_default_memory_pool = lambda: SimpleNamespace(free_bytes=lambda: 0)
@@ -71,11 +86,6 @@ class WorkerGpu:
             return lambda grid, block, arguments: self._arguments.__setitem__(name, arguments)
 
         return {name: kernel(name) for name in KERNELS}
-
-    def _stream(self) -> Any:
-        stream = mock.MagicMock(ptr=1)
-        stream.end_capture = self._graph
-        return stream
 
     def _graph(self) -> Any:
         blocks, _, status = self._arguments["check_finite"]

@@ -18,11 +18,11 @@ from protocol.messages_pb2 import FactorBatch, MatrixBatch
 from protocol.shared_memory.limits import obstacle
 from protocol.shared_memory.view import SlotMap
 from protocol.validate import checksum
-from sim_server.network import factor_intake, job_sender, worker_choice
+from sim_server.network import factor_decoder, factor_intake, job_sender, worker_choice
 from sim_server.network.batch_message import MOST_TOGETHER
-from sim_server.network.factor_decoder import FactorDecoder
 from sim_server.network.link import ServerLink
 from sim_server.network.send_queue import SendQueue
+from sim_server.network.worker_timing import WorkerTiming
 from sim_server.updates.factor_source import Job
 from tests.ports import free_endpoint
 
@@ -244,7 +244,7 @@ def test_an_error_that_no_check_foresees_costs_its_message_alone(
     if beside:
         monkeypatch.setattr(factor_intake, "LARGE_MESSAGE", 0)
     batch, refusals = stage.batch(), stage.driver.link.counters.refusals["unexpected"]
-    monkeypatch.setattr(FactorDecoder, "_taken", broken)
+    monkeypatch.setattr(factor_decoder, "native_copies", broken)
     stage.send(stage.answer(batch, [0, 2]))
     stage.driver.until(lambda: stage.failed() == {"a", "c"}, "the refusals")
     assert "was refused: factors of a and 1 more by worker hand: IndexError" in stage.driver.failures[0][1]
@@ -254,6 +254,24 @@ def test_an_error_that_no_check_foresees_costs_its_message_alone(
     stage.driver.until(lambda: all_are_back(stage), "the others")
     stage.check_factors()
     assert stage.made() == {"b", "d"} and stage.driver.link.slots_lent == 0
+
+
+@pytest.mark.parametrize("beside", [False, True], ids=["at once", "in a thread"])
+def test_factors_are_used_and_their_jobs_over_though_taking_note_of_them_fails(
+    stage: Hand, beside: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def broken(*arguments: Any) -> None:
+        raise IndexError("index 7 is out of bounds")
+
+    if beside:
+        monkeypatch.setattr(factor_intake, "LARGE_MESSAGE", 0)
+    batch, refusals = stage.batch(), stage.driver.link.counters.refusals["unexpected"]
+    monkeypatch.setattr(WorkerTiming, "record_all", broken)
+    stage.send(stage.answer(batch))
+    stage.driver.until(lambda: all_are_back(stage), "the answers")
+    stage.check_factors()
+    assert len(stage.made()) == 4 and not stage.driver.failures and stage.driver.link.slots_lent == 0
+    assert stage.driver.link.counters.refusals["unexpected"] == refusals + 1
 
 
 def test_a_failed_job_is_told_with_its_reason(stage: Hand) -> None:

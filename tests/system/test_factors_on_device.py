@@ -182,7 +182,7 @@ def test_one_worker_of_two_servers_opens_the_memory_of_both(memory: StandInMemor
     try:
         with (
             server(endpoint, memory, "sim") as one,
-            ServerLink("sim2", None, [endpoint]) as link,
+            ServerLink("sim2", [free_endpoint()], [endpoint]) as link,
         ):
             link.share_device(other)
             link.announce(BEAM)

@@ -3,6 +3,7 @@
 
 import logging
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
@@ -73,11 +74,45 @@ def test_the_factor_is_refused_and_the_next_is_taken(
         unexpected(driver, count)
     monkeypatch.undo()
     assert [name for name, _ in driver.failures] == ["beam", "beam"]
+    assert driver.link.dispatch.consecutive_failures() == {}, "the worker may have done nothing wrong"
     assert "was refused: factor of beam by worker hand: IndexError: index 7 is out of bounds" in driver.failures[0][1]
     warned = [r.getMessage() for r in caplog.records if r.levelno == logging.WARNING and "IndexError" in r.getMessage()]
     assert len(warned) == 1 and "factor of beam by worker hand" in warned[0]
     traced = [r for r in caplog.records if r.exc_info]
     assert len(traced) == 2 and {r.levelno for r in traced} == {logging.DEBUG}
+    taken(driver, hand)
+
+
+def test_a_thread_that_cannot_start_costs_one_factor(
+    stage: tuple[Driver, HandWorker], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    driver, hand = stage
+
+    def full(*arguments: Any) -> None:
+        raise RuntimeError("can't start new thread")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(factor_intake, "LARGE", 0)
+        patch.setattr(ThreadPoolExecutor, "submit", full)
+        round_of(driver, hand)
+        unexpected(driver, 1)
+    assert "can't start new thread" in driver.failures[0][1] and driver.link.dispatch.consecutive_failures() == {}
+    taken(driver, hand)
+
+
+def test_an_error_at_the_end_of_a_decoding_costs_its_factor_alone(
+    stage: tuple[Driver, HandWorker], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    driver, hand = stage
+    monkeypatch.setattr(factor_intake, "LARGE", 0)
+    leases = driver.link.dispatch.leases
+    match = leases.match_answer
+    calls = [match, broken]
+    with monkeypatch.context() as patch:
+        patch.setattr(leases, "match_answer", lambda *each: (calls.pop(0) if calls else match)(*each))
+        round_of(driver, hand)
+        unexpected(driver, 1)
+    assert [name for name, _ in driver.failures] == ["beam"]
     taken(driver, hand)
 
 

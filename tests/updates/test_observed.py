@@ -13,7 +13,7 @@ from sim_server.backends.cpu.structs import RECORD
 from sim_server.backends.kinds import Kind
 from sim_server.recording import messages
 from sim_server.service.telemetry import Telemetry
-from sim_server.updates.body_state import on_factors
+from sim_server.updates.body_state import on_checks, on_factors
 from sim_server.updates.driver import Driver
 from sim_server.updates.scheduler import pick
 from sim_server.updates.solve_observer import MIN_TOGETHER
@@ -121,7 +121,7 @@ def test_many_factors_say_what_each_says():
                     state.on_job(factor.step, Method())
                     state.job.in_flight, state.job.sent = True, factor.step
                     if checked[k]:  # beside the steps, and a newer matrix was sent meanwhile, or none
-                        state.on_check(factor.step)
+                        on_checks(driver.table, [state], [factor.step])
                         state.job.in_flight, state.job.sent = bool(newer[k]), factor.step + int(newer[k])
         expected = [one.bodies[k].on_factor(factor, step) for k, factor in factors.items()]
         states = [many.bodies[k] for k in factors]

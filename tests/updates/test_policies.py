@@ -22,10 +22,10 @@ from sim_server.backends.kinds import Kind
 from sim_server.simulation import Simulation
 from sim_server.updates import driver as driver_module
 from sim_server.updates.driver import Driver
-from sim_server.updates.factor_check import FactorCheck
 from sim_server.updates.factor_source import Inline, Job
 from sim_server.updates.policies.free_running import MAX_REQUESTS, Adaptive
 from sim_server.updates.stats import flops
+from sim_server.updates.update_table import NONE
 from tests.scenes import bar, factor_of, simulation
 from tests.solver.solves import applied
 from tests.support.virtual_workers import VirtualWorkers
@@ -486,6 +486,21 @@ def test_large_factors_are_checked_beside_the_steps(sent):
     assert driver.bodies[0].factors.used == 1 and driver.checks == []
 
 
+def test_of_two_factors_of_a_body_that_come_together_the_second_waits_for_the_check_of_the_first(sent, monkeypatch):
+    """Where many small ones are checked together."""
+    driver, factor, go = sent
+    monkeypatch.setattr(driver_module, "LARGE", 1 << 40)
+    monkeypatch.setattr(driver_module, "MANY", 1)
+    driver.adopt([factor, replace(factor, step=factor.step + 1)])
+    assert [len(each.factors) for each in driver.checks] == [1] and driver.bodies[0].job.checked == factor.step
+    go.set()
+    for newest in (factor.step, factor.step + 1):
+        wait([each.reasons for each in driver.checks])
+        driver.receive(driver.source, driver.adopt)
+        assert driver.bodies[0].factors.newest == newest
+    assert driver.bodies[0].factors.used == 2 and driver.bodies[0].job.checked == NONE
+
+
 def test_a_large_factor_that_is_no_use_is_refused_beside_the_steps(sent):
     driver, factor, go = sent
     driver.adopt([replace(factor, values=np.full_like(factor.values, np.nan))])
@@ -495,20 +510,36 @@ def test_a_large_factor_that_is_no_use_is_refused_beside_the_steps(sent):
     assert driver.bodies[0].failures.refused == 1 and not driver.bodies[0].job.in_flight
 
 
+def test_a_check_that_cannot_begin_refuses_the_factor_and_the_run_goes_on(sent, monkeypatch):
+    driver, factor, _ = sent
+
+    def full(*_):
+        raise RuntimeError("can't start new thread")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(driver.engine, "prepare_factor", full)
+        driver.adopt([factor])
+    driver.advance(1)
+    assert driver.checks == [] and driver.bodies[0].job.checked == NONE and driver.bodies[0].failures.refused == 1
+
+
 @pytest.mark.parametrize("beside", [True, False], ids=["beside the steps", "at once"])
 def test_a_check_that_fails_by_itself_refuses_the_factor_and_the_run_goes_on(sent, monkeypatch, beside):
-    driver, factor, _ = sent
+    driver, factor, go = sent
     if not beside:
         monkeypatch.setattr(driver_module, "LARGE", 1 << 40)
-    check = driver.check._judged
-    monkeypatch.setattr(driver.check, "reject_reasons", FactorCheck.reject_reasons.__get__(driver.check))
-    monkeypatch.setattr(driver.check, "_judged", lambda *_: {}["nose"])
+    check, blamed = driver.check.reject_reasons, []
+    go.set()
+    monkeypatch.setattr(driver.source, "factor_failed", lambda *each: blamed.append(each))
+    monkeypatch.setattr(driver.check, "reject_reasons", lambda *_: {}["nose"])
     driver.adopt([factor])
     wait([each.reasons for each in driver.checks])
     assert driver.advance(2)["factor_step"].tolist() == [-1, -1]
     assert driver.bodies[0].failures.refused == 1 and not driver.checks
-    assert driver.bodies[0].failures.reported == {"that of w is not used: its check failed: KeyError: 'nose'"}
-    monkeypatch.setattr(driver.check, "_judged", check)
+    (reported,) = driver.bodies[0].failures.reported
+    assert reported.startswith("that of w is not used: its check failed: KeyError: 'nose' (test_policies.py")
+    assert driver.counters.refusals == {"unexpected": 1} and blamed == []
+    monkeypatch.setattr(driver.check, "reject_reasons", check)
     driver.adopt([replace(factor, step=driver.engine.step)])
     wait([each.reasons for each in driver.checks])
     driver.advance(1)

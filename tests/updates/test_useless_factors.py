@@ -39,7 +39,7 @@ class Stiffened(Inline):
         rows = np.repeat(np.arange(nodes), np.diff(row_start))
         return super().submit(replace(job, values=job.values * (scale[rows] * scale[columns])[:, None, None]))
 
-    def factor_failed(self, worker: str, object: str) -> None:
+    def factor_failed(self, worker: str, object: str, pattern: int | None = None) -> None:
         self.told.append(("no use", worker, object))
 
     def factor_helped(self, worker: str, object: str) -> None:

@@ -2,13 +2,14 @@
 """The engine of a GPU: one CUDA graph per step.
 
 The graph holds the launches of the scene and the persistent solver, whose stop test is on the device. The native loop
-(loop.cpp) launches graphs, copies mail to the device and reads results. This module captures the graphs and posts
-settings, factors and arguments.
+(loop.cpp) launches graphs, copies mail to the device and reads results. This module gives it the graphs
+(step_graphs.py) and posts settings, factors and arguments.
 """
 
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future
+from contextlib import ExitStack
 from functools import partial
 from typing import Any, cast
 
@@ -27,18 +28,16 @@ from sim_server.backends.gpu.factor_upload import FactorUpload
 from sim_server.backends.gpu.helper import alone
 from sim_server.backends.gpu.host_results import HostResults
 from sim_server.backends.gpu.known_patterns import KnownPatterns
-from sim_server.backends.gpu.loop import CAPACITY, GRAPH_STEPS, DeviceLoop
+from sim_server.backends.gpu.loop import CAPACITY, DeviceLoop
 from sim_server.backends.gpu.mailbox import ChangeMailbox, DeviceMailbox
 from sim_server.backends.gpu.pinned import pinned_array
 from sim_server.backends.gpu.shared_device_memory import SharedDeviceMemory
 from sim_server.backends.gpu.solver import PCG_BODY, SETTINGS_BYTES
 from sim_server.backends.gpu.splits import Staged
+from sim_server.backends.gpu.step_graphs import StepGraphs, handle
 from sim_server.backends.gpu.step_records import StepRecords
 from sim_server.backends.gpu.step_sequence import StepSequence
-from sim_server.backends.gpu.structs import (
-    DeviceChanges,
-    Mail,
-)
+from sim_server.backends.gpu.structs import DeviceChanges, Mail
 from sim_server.backends.state import StateArray
 
 MOST_GRABS = 1024  # pushes and grabs at a time, of which forces are told
@@ -46,7 +45,6 @@ GRAB_BLOCKS, GRAB_THREADS = 32, 128  # of the kernel react (effects/touch.cu)
 PREPARED_WITHIN = 1.0  # s in which an inverse that is prepared for a check is begun, else the check goes without
 AT_A_TIME = 2  # factors of a body: one comes while the one before it is built
 MEMORY_AHEAD = 4 << 20, 256 << 20  # bytes of factors for which memory is taken before they come
-FEW = 16  # largest number of trials in a step without loops for which several steps are captured in one graph
 
 
 class DeviceSettings:
@@ -82,6 +80,7 @@ class GpuEngine(DeviceLoop):
     def __init__(self, gpu: Gpu, given: EngineInput, records: int | None = None):
         device, arrays, cut = CudaDevice(gpu.cp), given.arrays, given.cut
         self.gpu, self._arrays, self._steps = gpu, arrays, device.step_stream
+        self._claim = ExitStack()  # of a second GPU, from the first to the second half of a step
         self.launches = cast(Sequence[DeviceLaunch], [*given.assemble, *given.integrate])
         results = HostResults.allocated(device, given)
         contact = results.contact
@@ -104,7 +103,9 @@ class GpuEngine(DeviceLoop):
         self._prepared = False
         self._changes, self._work_graphs = ChangeMailbox(self.loop), list[Graph]()
         self._known: Float64 = arrays["values"]  # as a factor is to know them
-        self._capture()
+        writer = StepRecords(gpu, self.solver.results, self._energies.records, CAPACITY, self.loop)
+        self._graphs = StepGraphs(self._steps, self.sequence, writer, self.targets)
+        self._graphs.give_to(self)
         if given.touch is not None:
             self._report_grabs(device, cast(DeviceLaunch, given.touch))
         gpu.cp.cuda.get_current_stream().synchronize()  # arrays are complete for the streams of the loop
@@ -189,32 +190,6 @@ class GpuEngine(DeviceLoop):
         """Restarts the energy balance from the state at the beginning of the next step, after x or v were set."""
         self._energies.started = False
 
-    def _capture(self) -> None:
-        """Captures the graphs of the steps, of the energies and of the records."""
-        sequence, newton = self.sequence, self.sequence.newton
-        many = newton is None or newton.loops or newton.rounds <= FEW
-        self._graphs: list[Graph | None] = []
-        for begin in (False, True):
-            for steps in GRAPH_STEPS:
-                wanted = steps == 1 or many
-                self._graphs.append(self._captured(partial(self._launch_steps, steps, begin)) if wanted else None)
-        others = [self._captured(self._energies.launch_balance), self._captured(self._energies.launch_elastic)]
-        if sequence.makes_matrix_apart:
-            others.append(self._captured(sequence.assemble_matrix))
-        writer = StepRecords(self.gpu, self.solver.results, self._energies.records, CAPACITY, self.loop)
-        records = [self._captured(partial(self._report, writer, target)) for target in self.targets]
-        handles = [int(graph.graphExec) if graph else 0 for graph in self._graphs]
-        self.use_graphs(handles, [int(g.graphExec) for g in records], *(int(graph.graphExec) for graph in others))
-        self._graphs += [*others, *records]  # kept as long as the engine
-        self._second_half = self._captured(sequence.finish) if sequence.branches else None
-
-    def _launch_steps(self, steps: int, begin: bool) -> None:
-        """Appends steps to the stream. begin: with the kernel that writes the time at which the first one begins"""
-        if begin:
-            self.sequence.begin()
-        for _ in range(steps):
-            self.sequence.launch()
-
     def _report_grabs(self, device: CudaDevice, touch: DeviceLaunch) -> None:
         """Captures the kernel that writes the forces on grabs, which follows a step only while there are some."""
         reactions = device.pinned(CAPACITY * MOST_GRABS * REACTION.itemsize).view(REACTION)
@@ -223,32 +198,22 @@ class GpuEngine(DeviceLoop):
         addresses = touch.mail_address, self.sequence.counter.data.ptr, reactions.ctypes.data, counts.ctypes.data
         arguments = (*map(np.uint64, addresses), np.int32(MOST_GRABS), np.int32(CAPACITY))
         kernel = touch.module.function("react")
-        graph = self._captured(lambda: kernel((GRAB_BLOCKS,), (GRAB_THREADS,), arguments))
-        self._graphs.append(graph)
-        self.report_grabs(int(graph.graphExec), self._mailed[self.launches.index(touch)], reactions, counts)
-
-    def _captured(self, launch: Callable[[], None]) -> Graph:
-        """Returns the graph of the work that `launch` appends to the stream."""
-        with self._steps:
-            self._steps.begin_capture()
-            launch()
-            return self._steps.end_capture()
-
-    def _report(self, records: StepRecords, target: int) -> None:
-        """Appends what ends a batch: the energy balance of its last step, the others' are part of the next step's first
-        kernel, and the records."""
-        self._energies.launch_balance()
-        records.launch(target)
+        graph = self._graphs.captured(lambda: kernel((GRAB_BLOCKS,), (GRAB_THREADS,), arguments))
+        self.report_grabs(handle(graph), self._mailed[self.launches.index(touch)], reactions, counts)
 
     def assemble(self) -> None:
         """Runs the first half of one step, and copies the system matrix to the host."""
-        self._make_ready()
-        self.open_step()
-        with self._steps:
-            self.sequence.assemble()
-            values = self._arrays["values"]
-            values[...] = self.gpu.twin(values).get(stream=self._steps)
-        self._known = self.sequence.known(values)
+        self._claim.close()
+        with ExitStack() as claim:
+            claim.enter_context(alone(self.solver.features.helper))  # refused here, no step is half made
+            self._make_ready()
+            self.open_step()
+            with self._steps:
+                self.sequence.assemble()
+                values = self._arrays["values"]
+                values[...] = self.gpu.twin(values).get(stream=self._steps)
+            self._known = self.sequence.known(values)
+            self._claim = claim.pop_all()
 
     def factor_matrix(self, body: int) -> Float64:
         """Returns the values of A as last assembled, with the contacts that a factor is to know, (blocks, 3, 3)."""
@@ -264,11 +229,12 @@ class GpuEngine(DeviceLoop):
 
     def solve(self) -> None:
         """Runs the second half: solve, integration, records."""
-        self._factor_upload.settle()
-        self.renew_mail()
-        with alone(self.solver.features.helper):
-            if self._second_half:  # with branches, which only graphs have
-                self._second_half.launch(self._steps)
+        graph = self._graphs.second_half
+        with self._claim:
+            self._factor_upload.settle()
+            self.renew_mail()
+            if graph:  # with branches, which only graphs have
+                graph.launch(self._steps)
             else:
                 with self._steps:
                     self.sequence.finish()
@@ -422,7 +388,7 @@ class GpuEngine(DeviceLoop):
         places = next((each.places for each in made if each.places is not None), None)
         if self.sequence.substeps:
             copies.append((self.sequence.substeps.since, int(self._estimate_now.data.ptr), 4))
-        before, after = (int(graph.graphExec) for graph in self._work_graphs)
+        before, after = (handle(graph) for graph in self._work_graphs)
         return self._changes.post(copies, before, after, (changes, self._estimate_now), places)
 
     def take_changes(self) -> None:

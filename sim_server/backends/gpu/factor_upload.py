@@ -622,6 +622,8 @@ class FactorUpload:
 
 
 def _on_host(values: NDArray[Any] | DeviceValues) -> NDArray[Any]:
+    """Returns values in memory of the host. Those that are there stay as they are: they may know their address
+    (Located), which np.asarray drops."""
     return values if isinstance(values, np.ndarray) else np.asarray(values)
 
 

@@ -10,7 +10,7 @@ struct IslandError {
     IterateError of;
     double told;          // of the last solve [m], 0: not known
 };
-static_assert(sizeof(IslandError) <= ERROR_BYTES, "see islands.py");
+static_assert(sizeof(IslandError) <= ERROR_BYTES, "see island_memory.py");
 
 __device__ __forceinline__ IslandError& error_of(const IslandArguments& a, int island) { return *(IslandError*)(a.errors + (long long)ERROR_BYTES * island); }
 

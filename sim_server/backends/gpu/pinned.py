@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from protocol.located import Located, address
+from protocol.shared_memory.located import Located, address
 from sim_server.backends.gpu.device_values import DeviceValues
 
 

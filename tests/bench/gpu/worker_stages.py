@@ -204,7 +204,7 @@ def spies(closing: ExitStack, stages: Counter[str], worker: Worker, connection: 
     """Has the stages timed: begin and end of a factorization take in sums, copies in and the check of pivots."""
     for holder, name, stage in (
         (worker, "take_in", "take in"), (made, "begin_many", "begin"), (made, "factorize", "factorize"),
-        (Copies, "sum_up", "sums"), (Copies, "sum_parts", "sums"), (Copies, "copy", "copies"),
+        (Copies, "sum_parts", "sums"), (Copies, "copy", "copies"),
         (Copies, "copy_parts", "copies"), (PivotCheck, "scales", "pivots"), (PivotCheck, "sound", "pivots"),
         (connection, "send_factors", "encode"),
     ):  # fmt: skip

@@ -59,7 +59,7 @@ static void solve_island(Loop& loop, int island, bool resumes) {
     Passes p(loop, island);
     const int first = p.bodies[0], set = resumes ? 0 : p.choose_set();
     bool outside = false;  // y was swept and enters nothing
-    int already = 0;  // passes in which nodes were set back that still are
+    int already = -1;  // passes in which nodes were set back that still are; a step that begins has none
     if (p.count > 1) IslandSolver::make_modes(loop, p.c, p.bodies, p.count);
     if (resumes) {
         p.take_up();

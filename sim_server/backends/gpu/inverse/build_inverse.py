@@ -135,7 +135,8 @@ class InverseBuilder:
         matrices = cp.zeros((count, p.chunks, ROWS, COLUMNS), np.float16)
         scales = cp.zeros((count, pitch), np.float32)[:, : p.size + 1]
         cp.cuda.get_current_stream().synchronize()
-        return [InverseStorage.of(matrix, scale) for matrix, scale in zip(matrices, scales, strict=True)]
+        made = [InverseStorage.of(matrix, scale) for matrix, scale in zip(matrices, scales, strict=True)]
+        return [each._replace(far=self._helper.storage(p)) for each in made] if self._helper else made
 
     def build(
         self, values: NDArray[np.floating] | DeviceValues, storage: InverseStorage, multiprocessors: int | None = None

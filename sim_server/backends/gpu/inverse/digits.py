@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from protocol.factor import FactorPattern
-from protocol.located import Located, address
+from protocol.shared_memory.located import Located, address
 from protocol.validate import helping_threads
 from sim_server.arrays import Float64
 from sim_server.backends.compiler import native

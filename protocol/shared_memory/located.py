@@ -14,9 +14,12 @@ class Located(np.ndarray):
 
 
 def address(array: NDArray[Any]) -> int:
-    """Returns the address of the first number of an array."""
+    """Returns the address of the first number of an array.
+
+    With fields the interface is described by code in Python, and NumPy drops what a signal raises in there.
+    """
     known: int = getattr(array, "address", 0)
-    return known or int(array.__array_interface__["data"][0])
+    return known or int(array.ctypes.data if array.dtype.names else array.__array_interface__["data"][0])
 
 
 def rows(memory: NDArray[Any], counts: list[int]) -> list[NDArray[Any]]:

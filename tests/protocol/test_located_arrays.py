@@ -3,11 +3,12 @@
 
 import copy
 import pickle
+import sys
 
 import numpy as np
 import pytest
 
-from protocol.located import Located, address, rows
+from protocol.shared_memory.located import Located, address, rows
 from protocol.shared_memory.pool import Slot
 
 
@@ -51,3 +52,22 @@ def test_parts_of_a_slot_lie_where_they_tell():
         assert part.size == count and address(part) == true(slot.array(np.uint8, 1)) + first
         assert part.size == 0 or address(part) == true(part)
     assert slot.part(16, np.uint8, 4).tolist() == [16, 17, 18, 19]
+
+
+def test_a_signal_that_comes_while_records_tell_their_address_is_not_lost():
+    """NumPy drops exceptions of the code by which it describes fields: a server lost the signal to end there."""
+
+    def interrupt(frame, event, _):
+        if event == "call" and "numpy" in frame.f_code.co_filename:
+            sys.setprofile(None)
+            raise KeyboardInterrupt
+
+    records = np.zeros(3, [("body", "i4"), ("step", "i8")])
+    assert address(records) == true(records)
+    before = sys.getprofile()
+    sys.setprofile(interrupt)
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            address(records)
+    finally:
+        sys.setprofile(before)
