@@ -86,6 +86,13 @@ struct BlockMemory {  // static shared memory of a thread block: data that is th
 #endif
 };
 __shared__ BlockMemory memory;
+#ifdef SECTIONS
+__device__ unsigned long long sections[32];
+__shared__ long long section_sums[32], section_mark;
+#define SECTION(k) if (threadIdx.x == 0) { const long long now = clock64(); section_sums[k] += now - section_mark; section_mark = now; }
+#else
+#define SECTION(k)
+#endif
 
 __device__ __forceinline__ bool usable(double a) { return a > 0 && a < 1e300; }
 
@@ -420,6 +427,7 @@ struct PcgSolver {
         const BlockRows HELD rows = memory.rows;
         if (packed) rows.form(memory.inverse.z, z_number, beta, [&](int k, float z) { return applied(rows, k, z); });
         else rows.form(s.z, z_number, beta, [](int, real z) { return z; });
+        SECTION(4)
 #ifdef ERRORS
         double z2 = largest2([&](int k) { return rows.q[k]; });
         __syncthreads();
@@ -433,6 +441,10 @@ struct PcgSolver {
 #endif
         });
         q_number = group.number;
+        SECTION(5)
+#ifdef PREFETCHED
+        if (packed) memory.inverse.prefetch();
+#endif
         into_three<4>(mine);
 #ifdef ERRORS
         group.sums<4, 3, true>(mine, out, false, &z2);
@@ -446,7 +458,9 @@ struct PcgSolver {
     // x += alpha p, r -= alpha q. The loads of a few entries travel together, as stores are behind all of them, where there are registers.
     __device__ __forceinline__ void update(real alpha) const {
         const BlockRows HELD rows = memory.rows;
-        constexpr int MANY_ENTRIES = WARPS > 8 ? 1 : 3;
+#ifndef MANY_ENTRIES
+#define MANY_ENTRIES (WARPS > 8 ? 1 : 3)
+#endif
         const int count = 3 * rows.own;
         for (int first = threadIdx.x; first < count; first += MANY_ENTRIES * THREADS) {
             real r[MANY_ENTRIES], x[MANY_ENTRIES], p[MANY_ENTRIES], q[MANY_ENTRIES];
@@ -477,6 +491,7 @@ struct PcgSolver {
     // 3. 4. 5. 6. x += alpha p, r -= alpha q, z = P^-1 r; returns z . r. r2: |r|^2 after the update.
     __device__ __forceinline__ double precondition(int kind, real alpha, double r2) {
         [[maybe_unused]] const BlockRows HELD rows = memory.rows;
+        SECTION(11)
 #ifdef LEAN_WORDS
 #ifdef CORRECTED
         if (column >= 0) {
@@ -531,6 +546,7 @@ struct PcgSolver {
 #else
         group.sums<1, 1>(mine, zr);
 #endif
+        SECTION(10)
 #ifdef HELPED
         if (kind == CHOLESKY && memory.inverse.far) zr[0] += memory.help.sum(group);
 #endif
@@ -587,6 +603,7 @@ struct PcgSolver {
         inverse.open(stream);
 #endif
         arrived = true;
+        SECTION(7)
 #ifdef HELPED
         if (inverse.far && group.index == 0)
             memory.help.apply(memory.body.helper, from.r == residuals(1), from.r_number, from.q_number, from.alpha, 1 - turn, group.number, unit);
@@ -594,6 +611,7 @@ struct PcgSolver {
         for (int phase = 0; phase < inverse.phases; ++phase) {
             inverse.gather(phase, from, group.number, unit);
             __syncthreads();
+            SECTION(8)
 #ifdef ALONE
             mine += inverse.multiply(phase, from, group.number, unit, stream);
 #else
@@ -603,6 +621,7 @@ struct PcgSolver {
 #if defined(ALONE) || !defined(EVEN_SHARES)
             if (phase + 1 < inverse.phases) __syncthreads();  // the vector has been read
 #endif
+            SECTION(16 + phase)
         }
 #ifdef CORRECTED
         if (column >= 0) return mine;
@@ -834,7 +853,9 @@ __device__ __forceinline__ void PcgSolver::solve() {
 #ifdef ERRORS
             const double found = r2;
 #endif
+            SECTION(11)
             r2 = residual(bb, !begun);
+            SECTION(3)
             measure = false;
             alpha = 1;
             restart = true;
@@ -972,6 +993,7 @@ __device__ __forceinline__ void PcgSolver::solve() {
 #else
                 direction(restart ? 0 : (real)(zr * inverse_of(memory.rz)), sums);
 #endif
+                SECTION(6)
                 memory.rz = zr;
                 restart = false;
                 out.iterations = ++iterations;
@@ -987,7 +1009,9 @@ __device__ __forceinline__ void PcgSolver::solve() {
                 }
             }
         }
+        SECTION(11)
         give(1, (real)alpha);
+        SECTION(13)
         measure = true;
     }
 }
@@ -1132,8 +1156,16 @@ __device__ __forceinline__ void solve_body(const PcgArguments& s, const RowRange
 #ifdef CORRECTED
     solver.body = k;
 #endif
+#ifdef SECTIONS
+    if (threadIdx.x == 0) { for (int i = 0; i < 32; ++i) section_sums[i] = 0; section_mark = clock64(); }
+#endif
     solver.set_up(range);
+    SECTION(2)
     solver.solve();
+    SECTION(12)
+#ifdef SECTIONS
+    if (threadIdx.x == 0) { section_sums[0] = memory.out.iterations; section_sums[1] = 1; for (int i = 0; i < 32; ++i) atomicAdd(sections + i, (unsigned long long)section_sums[i]); }
+#endif
 #ifdef CORRECTED
     if (range.index == 0) solver.keep_correction();
 #endif

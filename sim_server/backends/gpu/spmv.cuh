@@ -31,7 +31,9 @@
 #define ROW_LANES (32 / WARP_ROWS)   // lanes that share a row: 4 or 8
 #define WINDOW_ROWS (WARP_ROWS * WARPS)  // of a slab of the window
 #define WINDOW_BLOCKS (17 * WINDOW_ROWS) // most blocks of A in it
+#ifndef AHEAD
 #define AHEAD 1                      // slabs on their way while one is multiplied
+#endif
 #define COLUMN 0x7fff
 #define TRANSPOSED 0x8000
 #else
@@ -254,10 +256,12 @@ struct BlockRows {
         return place < ring ? place : place - ring;
     }
 
+#ifndef COPIED_BY
 #ifdef HALF_WARPS
 #define COPIED_BY 16  // lanes that copy a row
 #else
 #define COPIED_BY 32
+#endif
 #endif
     // Begins to copy the blocks of rows from the diagonal on, a row by each warp, or half of one.
     __device__ __forceinline__ void ask_rows(int low, int high, int first, int at) const {
@@ -328,11 +332,23 @@ struct BlockRows {
             sum[1] += a[row] * v0 + a[4] * v1 + a[row + 2 * column] * v2;
             sum[2] += a[2 * row] * v0 + a[2 * row + column] * v1 + a[8] * v2;
         }
+#ifdef SPLIT_SUMS
+        // The half of the lanes with the larger h adds entry 2, of the others a half each entries 0 and 1.
+        const bool third = h & ROW_LANES / 2, second = h & ROW_LANES / 4;
+        const real one = __shfl_xor_sync(ALL, third ? sum[0] : sum[2], ROW_LANES / 2), two = __shfl_xor_sync(ALL, sum[1], ROW_LANES / 2);
+        const real keep = (third ? sum[2] : sum[0]) + one, other = third ? keep : sum[1] + two;
+        real mine = second ? other : keep;
+        mine += __shfl_xor_sync(ALL, second ? keep : other, ROW_LANES / 4);
+#pragma unroll
+        for (int by = ROW_LANES / 8; by > 0; by /= 2) mine += __shfl_xor_sync(ALL, mine, by);
+        if (node < end && h % (ROW_LANES / 4) == 0 && h < 3 * ROW_LANES / 4) done(node, h / (ROW_LANES / 4), mine);
+#else
 #pragma unroll
         for (int r = 0; r < 3; ++r)
 #pragma unroll
             for (int by = 1; by < ROW_LANES; by *= 2) sum[r] += __shfl_xor_sync(ALL, sum[r], by);
         if (node < end && h < 3) done(node, h, h == 0 ? sum[0] : h == 1 ? sum[1] : sum[2]);
+#endif
     }
 #endif
 

@@ -483,6 +483,19 @@ struct PartitionedInverse {
         unsigned long long policy;
     };
 
+#ifdef PREFETCHED
+    // Begins to bring the first chunks that each warp will need into L2, PREFETCHED bytes of them.
+    __device__ __forceinline__ void prefetch() const {
+        const int warp = threadIdx.x / 32, first = lists[phases + 1], count = lists[phases + 2] - first, total = chunks_of(first, count);
+        const int low = share(warp, total);
+        const Tile tile = tiles[tile_at(first, count, low)];
+        const int at = tile.chunk - begin + low - tile.before, last = plan->block_ranges[0].chunks;
+        if (at < near || threadIdx.x % 32) return;
+        const int bytes = min(PREFETCHED, 512 * (last - at));
+        asm volatile("cp.async.bulk.prefetch.L2.global [%0], %1;" ::"l"(matrix + 32ll * at), "r"(bytes));
+    }
+#endif
+
     __device__ __forceinline__ void open(Stream& s) const {
         s.turn = s.next = s.high = s.left = s.plane = 0;
         s.phase = -1;
