@@ -79,11 +79,11 @@ ASSEMBLY = {  # bodies of functions whose text is for a GPU alone
     "half_of": "_Float16 h = (_Float16)v; unsigned short bits; std::memcpy(&bits, &h, 2); return bits;",
     "of_half": "_Float16 v; std::memcpy(&v, &h, 2); return (float)v;",
     "shared_address": "return (unsigned)((const char*)p - shared_memory);",
-    "shared_load": "return wanted ? *(const uint4*)(shared_memory + from) : uint4{};",
     "shared_vector_load": "return *(const uint4*)(shared_memory + from);",
     "shared_pair_load": "return wanted ? *(const uint2*)(shared_memory + from) : uint2{};",
     "chunk_load": "return from[32 * K];",
     "chunk_policy": "return 0;",
+    "prefetch_chunks": "",
     "multiply_add": "matrix_product(sum, a0, a1, a2, a3, b0, b1);",
 }
 MATRIX = """
@@ -128,7 +128,7 @@ def compiled(folder: Path, *defined: str) -> c.CDLL:
     for name, body in ASSEMBLY.items():
         whole = rf"(__device__ __forceinline__ [\w ]+ {name}\([^)]*\) )(\{{[^\n]*\}}|\{{\n.*?\n\}})\n"
         inverse, found = re.subn(whole, lambda m, b=body: f"{m[1]}{{ {b} }}\n", inverse, flags=re.DOTALL)
-        assert found == 1 or name in ("shared_pair_load", "chunk_load", "chunk_policy"), name
+        assert found == 1, name
     assert "asm" not in inverse
     for name, text in {"block_group.cuh": group, "partitioned_inverse.cuh": inverse}.items():
         (folder / name).write_text(text)
@@ -156,7 +156,7 @@ class Host:
 
 def applied(library: c.CDLL, p: Plan, s: Any, shared: int, alone: bool, alpha: float) -> tuple[NDArray, float]:
     """z of r - alpha q, and z . r."""
-    device = DevicePlan(Host, p, THREADS // 32)  # type: ignore[arg-type]
+    device = DevicePlan(Host, p)  # type: ignore[arg-type]
     chunks, scale = stored(s.pattern, s.factor, p, np.float16)
     scale = scale.astype(np.float32)
     at = (p.place[:, None] + np.arange(3)).ravel()
@@ -194,8 +194,7 @@ def applied(library: c.CDLL, p: Plan, s: Any, shared: int, alone: bool, alpha: f
 
 
 CASES = {
-    "plain": (), "operands": ("OPERANDS",), "even shares": ("EVEN_SHARES",), "both": ("OPERANDS", "EVEN_SHARES"),
-    "lean": ("OPERANDS", "EVEN_SHARES", "LEAN_WORDS", "UNDER_WAY=2", "CHUNKS_AT_ONCE=2"),
+    "plain": (), "lean": ("LEAN_WORDS", "UNDER_WAY=2", "CHUNKS_AT_ONCE=2"),
 }  # fmt: skip
 
 
@@ -207,8 +206,8 @@ def form(request):
 @pytest.fixture(scope="module", params=CASES)
 def library(request, form, tmp_path_factory):
     defined = CASES[request.param]
-    if (form == "alone" and len(defined) == 1) or (form != "alone" and "LEAN_WORDS" in defined):
-        pytest.skip("one thread block has both or none; several exchange what lean words leave out")
+    if form != "alone" and "LEAN_WORDS" in defined:
+        pytest.skip("several exchange what lean words leave out")
     if form == "alone":
         defined = (*defined, "ALONE")
     made = compiled(tmp_path_factory.mktemp("inverse"), *defined)

@@ -618,7 +618,7 @@ struct PcgSolver {
             mine += inverse.multiply(phase, from, group.number, unit);
 #endif
             from = {residuals(1 - turn), group.number, 0, 0};
-#if defined(ALONE) || !defined(EVEN_SHARES)
+#if defined(ALONE)
             if (phase + 1 < inverse.phases) __syncthreads();  // the vector has been read
 #endif
             SECTION(16 + phase)
@@ -1019,7 +1019,7 @@ __device__ __forceinline__ void PcgSolver::solve() {
 #ifdef STAGES  // an attempt of a Rosenbrock-W step (stages.cuh): solve only the bodies that make it
 #define KIND_OF_STEP , const StageSolve stage
 #define STAGE , stage
-#elif defined(NEWTON_PHASES)  // several linearizations a step: solve only the bodies in phase 0 (newton.cu)
+#elif defined(NEWTON_PHASES)
 #ifdef JUDGES
 #define KIND_OF_STEP , const int* __restrict__ active, const int* __restrict__ phase, Search* search
 #define STAGE , search
@@ -1027,7 +1027,7 @@ __device__ __forceinline__ void PcgSolver::solve() {
 #define KIND_OF_STEP , const int* __restrict__ active, const int* __restrict__ phase
 #define STAGE
 #endif
-#elif defined(CONTACT_PASSES)  // contact: in the first solve of a step all bodies, then those that are READY (contact_state.cuh)
+#elif defined(CONTACT_PASSES)
 #define KIND_OF_STEP , const ContactSolve pass
 #define STAGE , pass
 #else

@@ -28,8 +28,8 @@ struct BlockRanges { int segment, segments, tile, tiles, chunk, chunks, unused[2
 struct DevicePlan {
     int phases, blocks, groups, size;
     const BlockRanges* block_ranges;  // (blocks,)
-    const int* lists;                 // (blocks, 4 phases + 2) of each phase: first segment (and the end), first tile (and the end), both
-                                      // within the part; warps that share a tile; first segment that is not formed here
+    const int* lists;                 // (blocks, 3 phases + 2) of each phase: first segment (and the end), first tile (and the end), both
+                                      // within the part; first segment that is not formed here
     const WarpSegment* segments;
     const Tile* tiles;
     const int* index;                 // (segments, 32) of each entry: its position (kinds 1 and 2), or the first of its contributions

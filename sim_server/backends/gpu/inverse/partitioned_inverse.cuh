@@ -1,9 +1,13 @@
 // SPDX-License-Identifier: MIT
 // z = P^-1 r by a partitioned inverse (plan.py): 2 P - 1 phases of dense products in float16 with float32 sums.
 //
-// A product of 16 rows x 32 columns is two matrix instructions. Their right factor is the vector, split into two columns of
-// float16 (value = high + low / 2048), which keep 22 bits of it, nearly those of float32. A warp needs five instructions for
-// 1024 bytes of matrix, so memory is the limit.
+// A product of 16 rows x 32 columns is two matrix instructions, of 8 rows each. The 16 bytes of a chunk that a lane loads are the left
+// factor of one as they are: their columns 0, 1 and 4, 5 its row, columns 2, 3 and 6, 7 its row eight further down. So of the right
+// factor, which is the vector, four columns are used: its halves for the former and for the latter. Entries of the vector are two numbers
+// of float16 (value = high + low / 2048), which keep 22 bits of it, nearly those of float32. A warp needs five instructions for 1024 bytes of
+// matrix, so memory is the limit.
+//
+// The warps of a thread block have equal shares of the chunks of a phase, wherever in a tile they begin and end.
 #pragma once
 #include "block_group.cuh"
 #ifdef HELPED
@@ -12,16 +16,15 @@
 
 #define LOW 2048.0f
 #ifndef CHUNKS_AT_ONCE
-#define CHUNKS_AT_ONCE 4
+#ifdef ALONE
+#define CHUNKS_AT_ONCE (THREADS > 256 ? 2 : 4)
+#else
+#define CHUNKS_AT_ONCE 8
+#endif
 #endif
 #ifndef UNDER_WAY
-#define UNDER_WAY 3  // 2 or 3 groups of so many chunks, for each warp: -DALONE, -DOPERANDS
+#define UNDER_WAY 3  // 2 or 3 groups of so many chunks, for each warp: -DALONE
 #endif
-// -DOPERANDS: the 16 bytes of a chunk that a lane loads are the left factor of one matrix instruction as they are: their columns 0, 1
-// and 4, 5 its row, columns 2, 3 and 6, 7 its row eight further down. So four columns of the right factor are used, the vector's halves
-// for the former and for the latter, and nothing is moved between registers.
-// -DEVEN_SHARES: the warps of a thread block have equal shares of the chunks of a phase, wherever in a tile they begin and end.
-constexpr int TILE_SUMS = 64;  // most partial products of shared tiles in a phase
 constexpr int PADDING = 32;    // entries behind vectors, to which padding refers
 #define LISTS 32768   // most bytes of a list that is copied to shared memory
 #ifdef ALONE          // words are at hand: few registers matter more
@@ -70,24 +73,10 @@ __device__ __forceinline__ void put_halves(const SplitVector& to, int i, float v
 
 // Place of entry `lane` of a segment in the vector.
 __device__ __forceinline__ int entry_place(int lane) {
-#ifdef OPERANDS
     return (lane & ~6) | (lane & 2) << 1 | (lane & 4) >> 1;  // of each eight: 0, 1, 4, 5, 2, 3, 6, 7
-#else
-    return lane;
-#endif
 }
 
 __device__ __forceinline__ unsigned shared_address(const void* p) { return (unsigned)__cvta_generic_to_shared(p); }
-
-// Loads 16 bytes of shared memory if `wanted`, else zeros, without a branch.
-__device__ __forceinline__ uint4 shared_load(unsigned from, bool wanted) {
-    uint4 v;
-    asm volatile(
-        "{.reg .pred p; setp.ne.s32 p, %5, 0; mov.b32 %0, 0; mov.b32 %1, 0; mov.b32 %2, 0; mov.b32 %3, 0;\n"
-        "@p ld.shared.v4.u32 {%0, %1, %2, %3}, [%4];}"
-        : "=r"(v.x), "=r"(v.y), "=r"(v.z), "=r"(v.w) : "r"(from), "r"((int)wanted));
-    return v;
-}
 
 __device__ __forceinline__ uint4 shared_vector_load(unsigned from) {
     uint4 v;
@@ -95,7 +84,6 @@ __device__ __forceinline__ uint4 shared_vector_load(unsigned from) {
     return v;
 }
 
-#ifdef OPERANDS
 #ifdef EVICT_FIRST  // chunks are the first to leave L2, so that A stays there from one product to the next
 #define PASSING ".L2::cache_hint"
 #define PASSING_POLICY ", %6"
@@ -119,6 +107,10 @@ __device__ __forceinline__ unsigned long long chunk_policy() {
     return policy;
 }
 
+__device__ __forceinline__ void prefetch_chunks(const uint4* from, int bytes) {
+    asm volatile("cp.async.bulk.prefetch.L2.global [%0], %1;" ::"l"(from), "r"(bytes));
+}
+
 // Loads 8 bytes of shared memory if `wanted`, else zeros, without a branch.
 __device__ __forceinline__ uint2 shared_pair_load(unsigned from, bool wanted) {
     uint2 v;
@@ -128,9 +120,8 @@ __device__ __forceinline__ uint2 shared_pair_load(unsigned from, bool wanted) {
         : "=r"(v.x), "=r"(v.y) : "r"(from), "r"((int)wanted));
     return v;
 }
-#endif
 
-// sum += a b: a of 16 rows x 16 columns, b of 16 x 8, of which two columns are used.
+// sum += a b: a of 16 rows x 16 columns, b of 16 x 8, of which four columns are used.
 __device__ __forceinline__ void multiply_add(float sum[4], unsigned a0, unsigned a1, unsigned a2, unsigned a3, unsigned b0, unsigned b1) {
 #if __CUDA_ARCH__ >= 800
     asm("mma.sync.aligned.m16n8k16.row.col.f32.f16.f16.f32 {%0, %1, %2, %3}, {%4, %5, %6, %7}, {%8, %9}, {%0, %1, %2, %3};"
@@ -154,9 +145,9 @@ struct PartitionedInverse {
     const float* scale;
     FlagWord<float> *residual, *product, *z, *formed, *solved, *contributed;
     SplitVector vector;
-    float* tile_sums;        // (TILE_SUMS, 16)
-    const int* lists;        // of the phases: first segment (phases + 1), first tile (phases + 1), warps that share a tile,
-                             // first segment that is not formed here
+    float* tile_sums;        // (WARPS, 2, 16) of the tile that a warp ends, and of the one that it begins, where others have the rest
+    const int* lists;        // of the phases: first segment (phases + 1), first tile (phases + 1), first segment that is
+                             // not formed here
     const WarpSegment* segments;
     const int* where;        // (segments, 32) DevicePlan.index
     const Tile* tiles;
@@ -208,13 +199,9 @@ struct PartitionedInverse {
         size = plan->size; phases = plan->phases; groups = plan->groups;
         vector.high = arena.take<unsigned short>(shared_plan->entries);
         vector.low = arena.take<unsigned short>(shared_plan->entries);
-#if !defined(ALONE)
-        tile_sums = arena.take<float>(16 * TILE_SUMS);
-#elif defined(EVEN_SHARES)
         tile_sums = arena.take<float>(16 * 2 * WARPS);
-#endif
         const BlockRanges part = plan->block_ranges[index];
-        lists = brought(plan->lists + index * (4 * phases + 2), 4 * phases + 2, arena);
+        lists = brought(plan->lists + index * (3 * phases + 2), 3 * phases + 2, arena);
         tiles = brought(plan->tiles + part.tile, part.tiles, arena);
     }
 
@@ -262,7 +249,7 @@ struct PartitionedInverse {
     // loads, so that their latencies overlap.
     __device__ __forceinline__ void gather(int phase, const ResidualSource& from, unsigned number, float unit) const {
         const int warp = threadIdx.x / 32, first = lists[phase], last = lists[phase + 1];
-        const int middle = phase < groups ? lists[3 * phases + 2 + phase] : first, formed_here = middle - first;
+        const int middle = phase < groups ? lists[2 * phases + 2 + phase] : first, formed_here = middle - first;
         if (phase == 0) {
             if (formed_here <= FEW * WARPS) residual_segments<FEW>(first + warp, middle, from, number, unit);
             else for (int k = first + warp; k < middle; k += MANY * WARPS) residual_segments<MANY>(k, middle, from, number, unit);
@@ -409,31 +396,21 @@ struct PartitionedInverse {
     __device__ __forceinline__ unsigned vector_address(int x) const {
         const int lane = threadIdx.x % 32;
         const unsigned short* half = (lane & 4 ? vector.low : vector.high) + x + 8 * (lane % 4);
-#ifdef OPERANDS
         half += lane & 8 ? 4 : 0;
-#endif
         return shared_address(half);
     }
 
     // Row `lane` (of sixteen) of what a warp has summed up, in lanes 0 to 15.
     static __device__ __forceinline__ float row_of(const float sum[2][4]) {
         const int lane = threadIdx.x % 32;
-#ifdef OPERANDS  // lanes 4 r and 4 r + 1: halves of row r; 4 r + 2 and 4 r + 3: of row r + 8
         const float* own = sum[0];
         float a = own[0], b = own[1], c = own[2], d = own[3];
         if (lane & 2) { a = sum[1][0]; b = sum[1][1]; c = sum[1][2]; d = sum[1][3]; }
         float part = lane & 1 ? c + d / LOW : a + b / LOW;
         part += __shfl_xor_sync(ALL, part, 1);
         return __shfl_sync(ALL, part, 4 * (lane % 8) + (lane & 8 ? 2 : 0));
-#else
-        const float upper = sum[0][0] + sum[1][0] + (sum[0][1] + sum[1][1]) / LOW;  // lane 4 r: row r
-        const float lower = sum[0][2] + sum[1][2] + (sum[0][3] + sum[1][3]) / LOW;  // and row r + 8
-        const float one = __shfl_sync(ALL, upper, 4 * (lane % 8)), two = __shfl_sync(ALL, lower, 4 * (lane % 8));
-        return lane & 8 ? two : one;
-#endif
     }
 
-#ifdef EVEN_SHARES
     // Chunks of all tiles of a phase, side by side; which of them a warp has: [share(w, total), share(w + 1, total)).
     __device__ __forceinline__ int chunks_of(int first, int count) const {
         return count > 0 ? tiles[first + count - 1].before + tiles[first + count - 1].chunks : 0;
@@ -456,10 +433,8 @@ struct PartitionedInverse {
             if (share(w + 1, total) > share(w, total)) value += tile_sums[16 * 2 * w + lane];
         return value;
     }
-#endif
 
 #ifdef ALONE
-#if defined(OPERANDS) && defined(EVEN_SHARES)
     // Chunks of a piece of a tile on their way to a warp: of its upper eight rows, and of its lower ones.
     struct Group {
         uint4 upper[CHUNKS_AT_ONCE], lower[CHUNKS_AT_ONCE];
@@ -492,7 +467,7 @@ struct PartitionedInverse {
         const int at = tile.chunk - begin + low - tile.before, last = plan->block_ranges[0].chunks;
         if (at < near || threadIdx.x % 32) return;
         const int bytes = min(PREFETCHED, 512 * (last - at));
-        asm volatile("cp.async.bulk.prefetch.L2.global [%0], %1;" ::"l"(matrix + 32ll * at), "r"(bytes));
+        prefetch_chunks(matrix + 32ll * at, bytes);
     }
 #endif
 
@@ -657,145 +632,6 @@ struct PartitionedInverse {
         return zr;
     }
 #else
-    // Chunks of a tile on their way to a warp: of its upper eight rows, and of its lower ones.
-    struct Group {
-        uint4 upper[CHUNKS_AT_ONCE], lower[CHUNKS_AT_ONCE];
-        int phase, x, count;  // of the tile; first entry of the vector; chunks
-        int rows, out;        // of a tile's last group: its rows, else 0; where this lane's row goes
-        float scale;          // likewise: its scale
-        bool last;            // of a plane
-    };
-
-    // The groups of a warp, one after another through all phases: three of them are on their way while one is multiplied, also from one
-    // phase to the next.
-    struct Stream {
-        Group group[3];
-        int turn, phase, job, plane, at;
-    };
-
-    __device__ __forceinline__ void open(Stream& s) const {
-        s.turn = s.phase = s.plane = s.at = 0;
-        s.job = threadIdx.x / 32;
-#pragma unroll
-        for (int n = 0; n < 3; ++n) {
-#pragma unroll
-            for (int k = 0; k < CHUNKS_AT_ONCE; ++k) s.group[n].upper[k] = s.group[n].lower[k] = make_uint4(0, 0, 0, 0);
-            ask(s, s.group[n]);
-        }
-    }
-
-    __device__ __forceinline__ void ask(Stream& s, Group& g) const {
-        while (s.phase < phases && s.job >= lists[phases + 2 + s.phase] - lists[phases + 1 + s.phase]) {
-            ++s.phase;
-            s.job = threadIdx.x / 32;
-        }
-        g.phase = s.phase;
-        if (s.phase == phases) return;
-        const Tile tile = tiles[lists[phases + 1 + s.phase] + s.job];
-        const int from = tile.chunk - begin + s.plane * tile.chunks + s.at, lane = threadIdx.x % 32;
-        g.count = min(CHUNKS_AT_ONCE, tile.chunks - s.at);
-        g.x = tile.x + 32 * s.at;
-        g.rows = 0;
-        const int second = tile.rows > 8 ? tile.chunks * planes : 0;  // rows that a tile has not are not used
-        if (from + second + g.count <= near) {
-            const unsigned a = shared_address(kept + lane) + 512 * from, b = a + 512 * second;
-#pragma unroll
-            for (int k = 0; k < CHUNKS_AT_ONCE; ++k)
-                if (k < g.count) {
-                    g.upper[k] = shared_vector_load(a + 512 * k);
-                    g.lower[k] = shared_vector_load(b + 512 * k);
-                }
-        } else {
-            const uint4 *a = matrix + 32ll * from + lane, *b = a + 32 * second;
-#pragma unroll
-            for (int k = 0; k < CHUNKS_AT_ONCE; ++k)
-                if (k < g.count) {
-                    g.upper[k] = __ldg(a + 32 * k);
-                    g.lower[k] = __ldg(b + 32 * k);
-                }
-        }
-        s.at += CHUNKS_AT_ONCE;
-        g.last = s.at >= tile.chunks;
-        if (!g.last) return;
-        s.at = 0;
-        if (++s.plane < planes) return;
-        g.rows = tile.rows;
-        g.out = tile.out + min(lane, tile.rows - 1);
-        if (s.phase < groups - 1) g.out = __ldg(plan->target + g.out);
-        else g.scale = __ldg(scale + g.out);
-        s.plane = 0;
-        s.job += WARPS;
-    }
-
-    // Products of a phase; returns this thread's part of z . r.
-    __device__ __forceinline__ double multiply(int phase, const ResidualSource& from, unsigned number, float unit, Stream& s) const {
-        const int lane = threadIdx.x % 32;
-        const bool forward = phase < groups - 1;
-        const float back = 1 / unit;
-        float sum[2][4] = {}, total = 0, weight = 1;
-        double zr = 0;
-        auto take = [&](Group& g) {
-            const unsigned half = shared_address((lane & 4 ? vector.low : vector.high) + g.x + 8 * (lane % 4));
-            uint4 v[CHUNKS_AT_ONCE];  // of its eight columns two are used: what the other lanes load does not matter
-#pragma unroll
-            for (int k = 0; k < CHUNKS_AT_ONCE; ++k) v[k] = shared_vector_load(half + 64 * min(k, g.count - 1));
-#pragma unroll
-            for (int k = 0; k < CHUNKS_AT_ONCE; ++k)
-                if (k < g.count) {
-                    const uint4 m = g.upper[k], n = g.lower[k];
-                    multiply_add(sum[0], m.x, n.x, m.y, n.y, v[k].x, v[k].y);
-                    multiply_add(sum[1], m.z, n.z, m.w, n.w, v[k].z, v[k].w);
-                }
-            const bool last = g.last;
-            const int rows = g.rows, i = g.out;
-            const float d = g.scale;
-            ask(s, g);
-            if (!last) return;
-            const float above = sum[0][0] + sum[1][0] + (sum[0][1] + sum[1][1]) / LOW;  // lane 4 r: row r
-            const float below = sum[0][2] + sum[1][2] + (sum[0][3] + sum[1][3]) / LOW;  // and row r + 8
-            const float one = __shfl_sync(ALL, above, 4 * (lane % 8)), two = __shfl_sync(ALL, below, 4 * (lane % 8));
-            total += weight * (lane & 8 ? two : one);
-            weight /= LOW;
-            for (int k = 0; k < 4; ++k) sum[0][k] = sum[1][k] = 0;
-            if (rows == 0) return;
-            const float value = back * total;
-            total = 0;
-            weight = 1;
-            if (lane >= rows) return;
-            if (forward) {
-                contributed[i].put(value, number);
-                return;
-            }
-            solved[i].put(value, number);
-            z[i].put(d * value, number);
-            if (d == 0) return;  // padding
-            float ri, qi = 0;
-            from.r[i].get(ri, from.r_number);
-            if (from.alpha != 0) product[i].get(qi, from.q_number);
-            zr += (double)value * (ri - from.alpha * qi);
-        };
-        for (;;) {
-            if (s.turn == 0) {
-                if (s.group[0].phase != phase) break;
-                take(s.group[0]);
-                __syncwarp();
-                s.turn = 1;
-            }
-            if (s.turn == 1) {
-                if (s.group[1].phase != phase) break;
-                take(s.group[1]);
-                __syncwarp();
-                s.turn = 2;
-            }
-            if (s.group[2].phase != phase) break;
-            take(s.group[2]);
-            __syncwarp();
-            s.turn = 0;
-        }
-        return zr;
-    }
-#endif
-#else
     // Sums over chunks [from, to) of this block's storage, and over those `second` further on, of the next eight rows; the
     // vector begins at `x`.
     template <bool NEAR>
@@ -804,7 +640,6 @@ struct PartitionedInverse {
         const unsigned half = vector_address(x), a = shared_address(kept + lane);
         const uint4* far = matrix + lane;
         for (int at = from; at < to; at += CHUNKS_AT_ONCE) {
-#ifdef OPERANDS
             uint4 m[CHUNKS_AT_ONCE], n[CHUNKS_AT_ONCE];
             uint2 v[CHUNKS_AT_ONCE];
 #pragma unroll
@@ -821,23 +656,6 @@ struct PartitionedInverse {
             }
         }
     }
-#else
-            uint4 m[CHUNKS_AT_ONCE], n[CHUNKS_AT_ONCE], v[CHUNKS_AT_ONCE];
-#pragma unroll
-            for (int k = 0; k < CHUNKS_AT_ONCE; ++k) {
-                const int c = min(at + k, to - 1);
-                m[k] = NEAR ? shared_load(a + 512 * c, true) : __ldg(far + 32ll * c);
-                n[k] = NEAR ? shared_load(a + 512 * (c + second), second > 0) : second ? __ldg(far + 32ll * (c + second)) : make_uint4(0, 0, 0, 0);
-                v[k] = shared_load(half + 64 * (c - from), lane < 8 && at + k < to);
-            }
-#pragma unroll
-            for (int k = 0; k < CHUNKS_AT_ONCE; ++k) {
-                multiply_add(sum[0], m[k].x, n[k].x, m[k].y, n[k].y, v[k].x, v[k].y);
-                multiply_add(sum[1], m[k].z, n[k].z, m[k].w, n[k].w, v[k].z, v[k].w);
-            }
-        }
-    }
-#endif
 
     // Row `lane` (of sixteen) of a tile's product over its chunks [low, high), in lanes 0 to 15.
     __device__ __forceinline__ float product_of(const Tile& tile, int low, int high) const {
@@ -858,9 +676,6 @@ struct PartitionedInverse {
     __device__ __forceinline__ double multiply(int phase, const ResidualSource& from, unsigned number, float unit) const {
         const int lane = threadIdx.x % 32, warp = threadIdx.x / 32;
         const int first = lists[phases + 1 + phase], count = lists[phases + 2 + phase] - first;
-#ifndef EVEN_SHARES
-        const int parts = lists[2 * phases + 2 + phase];
-#endif
         const bool forward = phase < groups - 1;
         const float back = 1 / unit;
         double zr = 0;
@@ -895,7 +710,6 @@ struct PartitionedInverse {
                 for (unsigned spins = 0; keep_polling(!q.unpack(qi, from.q_number), spins);) q = product[i].load();
             zr += (double)value * (ri - from.alpha * qi);
         };
-#ifdef EVEN_SHARES
         const int total = chunks_of(first, count), low = share(warp, total), high = share(warp + 1, total);
         int open = 0;  // end of a tile that this warp begins and others end
         for (int next = low, at = tile_at(first, count, low); next < high; ++at) {
@@ -916,33 +730,5 @@ struct PartitionedInverse {
         if (open > 0) finish(back * joined(warp, total, open));
         return zr;
     }
-#else
-        const int row = threadIdx.x;
-        bool here = row < 16 * count;
-        if (parts > 1 && here) {
-            here = row % 16 < tiles[first + row / 16].rows;
-            if (here) look_up(tiles[first + row / 16], row % 16);
-        }
-        for (int job = warp; job < count * parts; job += WARPS) {
-            __syncwarp();  // some lanes may still be in `finish`
-            const int at = parts > 1 ? job / parts : job, part = job - at * parts;
-            const Tile tile = tiles[first + at];
-            if (parts == 1 && lane < tile.rows) look_up(tile, lane);
-            const float value = product_of(tile, tile.chunks * part / parts, tile.chunks * (part + 1) / parts);
-            if (lane >= tile.rows) continue;
-            if (parts > 1) tile_sums[16 * job + lane] = value;
-            else finish(back * value);
-        }
-        if (parts > 1) {
-            __syncthreads();
-            if (here) {
-                float value = 0;
-                for (int k = 0; k < parts; ++k) value += tile_sums[16 * (row / 16 * parts + k) + row % 16];
-                finish(back * value);
-            }
-        }
-        return zr;
-    }
-#endif
 #endif
 };
