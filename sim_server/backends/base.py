@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
-from enum import Enum, auto
+from enum import Enum, IntEnum, auto
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
@@ -123,6 +123,14 @@ class SolveSettings(Protocol):
     most_linearizations: int
 
 
+class Due(IntEnum):
+    """What the wait for a step ended with."""
+
+    STOP = 0  # the loop is to stop
+    NEXT = 1  # a step of a run
+    SINGLE = 2  # one of those that are made in a pause; it is not counted any more
+
+
 class LoopState(Protocol):
     """Memory that a running loop shares with other threads.
 
@@ -213,8 +221,8 @@ class Engine(Protocol):
         """Between `assemble` and `solve`: what the step has waited for is no part of its time."""
         ...
 
-    def wait(self) -> bool:
-        """Sleeps until the next step is due (real time) and while paused; returns False if the loop is to stop."""
+    def wait(self) -> Due:
+        """Sleeps until the next step is due (real time) and while paused."""
         ...
 
     def records(self) -> NDArray[np.void]:
@@ -332,6 +340,11 @@ class Engine(Protocol):
     def copy_memory(self, body: int) -> Float64 | None:
         """Returns memory (blocks, 3, 3) that the loop brings the next matrix of a body to by itself: as target of
         `request_matrix` it saves a copy. The matrix behind that one leaves it alone. None: there is none such."""
+        ...
+
+    def request_matrices(self, bodies: Sequence[int]) -> list[Float64] | None:
+        """Does `request_matrix` for the `copy_memory` of each of some bodies, and returns that memory; None, and does
+        nothing: there is none."""
         ...
 
     def request_positions(self, body: int, target: Float64, ahead: float = 0.0) -> None:

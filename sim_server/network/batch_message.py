@@ -2,7 +2,6 @@
 """Several jobs in one message: their matrices one after another in one slot, and rooms for their factors in another."""
 
 from collections.abc import Sequence
-from functools import cache
 from itertools import chain
 from typing import NamedTuple
 
@@ -31,12 +30,12 @@ class Entry(NamedTuple):
     first: int
 
 
-def entries_of(jobs: Sequence[tuple[Job, AnnouncedObject]]) -> list[Entry]:
-    """Lays out the rooms of factors that are as large as the largest so far."""
-    made, first, bytes_of = [], 0, cache(lambda dtype: np.dtype(dtype).itemsize)
-    for job, known in jobs:
-        size = known.most_values(job.method.name) * bytes_of(job.dtype)
-        room = -(-size // ROOM_ALIGNMENT) * ROOM_ALIGNMENT
+def entries_of(jobs: Sequence[tuple[Job, AnnouncedObject, int]]) -> list[Entry]:
+    """Lays out the rooms of factors of one type. jobs: with what is known of their objects, and for how many values of
+    a factor there is to be room."""
+    made, first, each = [], 0, np.dtype(jobs[0][0].dtype).itemsize
+    for job, known, values in jobs:
+        room = -(-values * each // ROOM_ALIGNMENT) * ROOM_ALIGNMENT
         made.append(Entry(job, known, room, first))
         first += room
     return made

@@ -112,10 +112,14 @@ class JobSender:
         idle = [name for name, room in rooms.items() if room > 0]
         failing = bool(self._book.reliability.failing_objects)
         last: tuple[str, str, Method] | None = None  # worker, dtype and method of the job before, by identity
+        sized: list[tuple[Job, AnnouncedObject, int]] = []  # by place
+        sizes: dict[tuple[int, str], int] = {}
         for place, job in enumerate(jobs):
             known = self._check(job)
             worker = self._worker_for(job, idle, rooms, failing) if idle else None
-            if worker is None or worker not in able or not self._fits_batch(job, known):
+            values = self._batched_values(job, known, sizes) if worker in able else 0
+            sized.append((job, known, values))
+            if worker is None or not values:
                 taken[place] = self.submit(job)
                 rooms = self._choice.rooms()
                 for (name, _), places in batches.items():
@@ -131,7 +135,7 @@ class JobSender:
         for (worker, _), places in batches.items():
             for k in range(0, len(places), MOST_TOGETHER):
                 part = places[k : k + MOST_TOGETHER]
-                for place, sent in zip(part, self._send_batch(worker, [jobs[p] for p in part]), strict=True):
+                for place, sent in zip(part, self._send_batch(worker, [sized[p] for p in part]), strict=True):
                     taken[place] = sent
         return taken
 
@@ -155,24 +159,35 @@ class JobSender:
             able = self._choice.candidates(able, job.object)
         return self._choice.choose(able, job.object, rooms) if able else None
 
-    def _fits_batch(self, job: Job, known: AnnouncedObject) -> bool:
-        """True if the size of the factor is known: that of an incomplete one may grow."""
+    def _batched_values(self, job: Job, known: AnnouncedObject, sizes: dict[tuple[int, str], int]) -> int:
+        """Returns for how many values of its factor there is room in a batch; 0 for a job that must go alone, as the
+        size of its factor is not known: that of an incomplete one may grow. sizes: of what objects of a topology share,
+        as far as it is known"""
         method = job.method.name
-        return job.values.ndim == 3 and method != "incomplete_cholesky" and known.most_values(method) > 0
+        if job.values.ndim != 3 or method == "incomplete_cholesky":
+            return 0
+        if method != COMPLETE or not known.complete.sizes:
+            return known.most_values(method)
+        key = id(known.complete), method
+        if (values := sizes.get(key)) is None:
+            values = sizes[key] = known.most_values(method)
+        return values
 
     # ---- a batch ---------------------------------------------------------------------------------------------
 
-    def _send_batch(self, worker: str, jobs: Sequence[Job]) -> list[bool]:
-        """Sends jobs to a worker in one message, or one by one if there are no slots for them together."""
-        slots, leases = None, self._book.leases
+    def _send_batch(self, worker: str, sized: Sequence[tuple[Job, AnnouncedObject, int]]) -> list[bool]:
+        """Sends jobs to a worker in one message, or one by one if there are no slots for them together. sized: as of
+        `entries_of`"""
+        slots, leases, jobs = None, self._book.leases, [job for job, _, _ in sized]
         if len(jobs) > 1:
-            entries = entries_of([(job, self._book.decoder.objects[job.object]) for job in jobs])
+            entries = entries_of(sized)
             slots = self._allocate_batch(entries)
         if slots is None:
             return [self._send_alone(worker, job) for job in jobs]
-        seconds = [leases.lease(job.object, worker, job.method.name) for job in jobs]
+        objects = [(job.object, known.blocks) for job, known, _ in sized]
+        seconds, exclusive = leases.terms(objects, worker, jobs[0].method.name)
         rooms = [(entry.first, entry.room) for entry in entries]
-        in_flight = self._begin(jobs, worker, seconds, slots, slots[1], rooms)
+        in_flight = self._begin(jobs, worker, seconds, slots, slots[1], rooms, exclusive=exclusive)
         message = batch_message(entries, in_flight, seconds, self._incarnation, *slots)
         filling, matrices = Filling(slots), [job.values for job in jobs]
         if self._queue.post(partial(self._fill_and_put, message, matrices, in_flight, filling)):
@@ -296,25 +311,26 @@ class JobSender:
     def _begin(
         self, jobs: Sequence[Job], worker: str, seconds: Sequence[float], slots: tuple[Slot | DeviceSlot, ...],
         factor_slot: Slot | None, rooms: Sequence[tuple[int, int]], payload_bytes: int = 0,
-        device_slot: DeviceSlot | None = None,
+        device_slot: DeviceSlot | None = None, exclusive: Sequence[float] = (),
     ) -> list[InFlightJob]:  # fmt: skip
         """Begins the leases of jobs that are being sent together.
 
         seconds: that the worker has for each. rooms: first byte and bytes of each in the slot of the factors
+        exclusive: their exclusive periods [s]; none: to be asked for
         """
         now, leases, objects = self._book.clock(), self._book.leases, self._book.decoder.objects
         latest, generation = leases.deadlines().get(worker, 0.0), factor_slot.generation if factor_slot else 0
         begun: list[InFlightJob] = []
         device_generation = device_slot.generation if device_slot else 0
-        for job, lease, (first, room) in zip(jobs, seconds, rooms, strict=True):
-            name, deadline = job.object, now + max(lease, min(latest - now, BEHIND))
+        periods = exclusive or [leases.exclusive_period(job.object, objects[job.object].blocks) for job in jobs]
+        for job, lease, (first, room), period in zip(jobs, seconds, rooms, periods, strict=True):
+            deadline = now + max(lease, min(latest - now, BEHIND))
             latest = max(latest, deadline)
-            exclusive = now + leases.exclusive_period(name, objects[name].blocks)
             begun.append(
                 InFlightJob(
-                    leases.next_number(), name, job.epoch, job.step, job.warp, _dtype_name(job.dtype), worker, deadline,
-                    factor_slot, generation, slots, first, room, now, exclusive, job.method.name, payload_bytes,
-                    job.values.ndim == 2, PART_BYTES, device_slot, device_generation,
+                    leases.next_number(), job.object, job.epoch, job.step, job.warp, _dtype_name(job.dtype), worker,
+                    deadline, factor_slot, generation, slots, first, room, now, now + period, job.method.name,
+                    payload_bytes, job.values.ndim == 2, PART_BYTES, device_slot, device_generation,
                 )
             )  # fmt: skip
         leases.start_all(begun)

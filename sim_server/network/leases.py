@@ -115,6 +115,24 @@ class Leases:
         doublings = self._doublings.get((object, worker), 0)
         return float(min(longest, max(MIN_LEASE, LEASE_FACTOR * known) * 2**doublings))
 
+    def terms(self, objects: Sequence[tuple[str, int]], worker: str, method: str) -> tuple[list[float], list[float]]:
+        """Returns `lease` and `exclusive_period` of each of some objects, whose matrices are sent. objects: names, and
+        blocks of their matrices"""
+        leases: list[float] = []
+        periods: list[float] = []
+        wanted = method, False
+        for name, blocks in objects:
+            seconds, pair = self._seconds.get(name), (name, worker)
+            if not seconds or len(seconds) > 1 or worker not in seconds or pair in self._doublings:
+                leases.append(self.lease(name, worker, method))
+                periods.append(self.exclusive_period(name, blocks))
+                continue
+            usual = LEASE_FACTOR * seconds[worker]
+            known = wanted in self._answered.get(pair, ())
+            leases.append(min(MAX_LEASE, max(MIN_LEASE, usual)) if known else MAX_LEASE)
+            periods.append(max(MIN_EXCLUSIVE, usual))
+        return leases, periods
+
     def exclusive_period(self, object: str, blocks: int) -> float:
         """Time [s] in which no other worker is asked for the object, by the duration at its fastest known worker."""
         known = min(self._seconds.get(object, {}).values(), default=None)

@@ -187,7 +187,7 @@ class Service:
         try:
             if self._loop_alone:
                 first = self._first if self._last is None or self.engine.step < self._last else None
-                if first is None or (self.engine.wait() and first.run()):
+                if first is None or ((due := self.engine.wait()) and first.run(due)):
                     self.engine.run(ENDLESS if self._last is None else self._last - self.engine.step)
                 return
             while not self.engine.loop.stop and (self._last is None or self.engine.step < self._last):

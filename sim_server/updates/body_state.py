@@ -298,6 +298,13 @@ class BodyUpdateState:
             self.solves.max_factor_age = max(self.solves.max_factor_age, int(record["step"]) - 1 - factor_step)
 
 
+def on_requests(states: Sequence[BodyUpdateState], copies: Sequence[NDArray[np.float64]]) -> None:
+    """Takes note of the memory that the loop is asked to copy the matrices of different bodies of one table into."""
+    for state, copy in zip(states, copies, strict=True):
+        state.job.copy = copy
+    states[0]._table.copying[[state._index for state in states]] = True
+
+
 def on_sent(table: UpdateTable, rows: Sequence[int], steps: Sequence[int]) -> None:
     """Takes note of copies that were sent, of some steps, in what the table has of them."""
     row = np.asarray(rows, np.int64)

@@ -10,6 +10,7 @@ import time
 from collections.abc import Callable
 from dataclasses import replace
 
+from sim_server.backends.base import Due
 from sim_server.updates.body_state import BodyUpdateState
 from sim_server.updates.driver import Driver
 from sim_server.updates.factor_source import Job
@@ -44,9 +45,14 @@ class FirstFactors:
         """Names of the bodies whose factor is waited for, or did not come in time."""
         return list(self._waiting)
 
-    def run(self) -> bool:
-        """Makes the first step. False: the loop was stopped meanwhile, in the middle of it."""
+    def run(self, due: Due = Due.NEXT) -> bool:
+        """Makes the first step. False: the loop was stopped meanwhile, in the middle of it.
+
+        due: what the engine waited for. A single step counts as one that is to be made until it is over.
+        """
         engine = self._driver.engine
+        if due is Due.SINGLE:
+            engine.loop.single += 1
         engine.assemble()
         begun = seen = self.begun = self._clock()
         while not engine.loop.stop:

@@ -6,14 +6,14 @@ which is checked with it; then its memory is used again, so that in the long run
 """
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from itertools import count
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sim_server.simulation import Simulation
-from sim_server.updates.body_state import BodyUpdateState
+from sim_server.updates.body_state import BodyUpdateState, on_requests
 from sim_server.updates.factor_source import FactorSource
 
 MAX_FAILED_ASSEMBLIES = 3  # jobs in a row with positions without a factor, after which matrices are sent for good
@@ -55,6 +55,22 @@ class SnapshotPool:
             engine.request_matrix(body.index, copy)
         job.set_copy(copy)
 
+    def request_all(self, states: Sequence[BodyUpdateState]) -> None:
+        """Does `request` for some bodies, at once where the loop has memory for their matrices."""
+        engine = self._simulation.engine
+        whole = self._solver.build != "worker" and self._simulation.splits is None
+        copies = engine.request_matrices([state.body.index for state in states]) if states and whole else None
+        if copies is None:
+            for state in states:
+                self.request(state)
+            return
+        now, number = time.monotonic(), self._requests
+        for state in states:
+            state.job.request, state.job.requested, state.job.extrapolated = next(number), now, 0.0
+            self._requested.pop(state.body.index, None)
+            self._requested[state.body.index] = state
+        on_requests(states, copies)
+
     def step(self, state: BodyUpdateState) -> int:
         """Returns the steps completed before the one whose matrix was copied; -1: the copy is not there yet."""
         step: int = self._simulation.engine.matrix_step(state.body.index)
@@ -62,8 +78,12 @@ class SnapshotPool:
 
     def completed(self) -> list[tuple[BodyUpdateState, int]]:
         """Returns the bodies whose copy is there, in the order of the requests, and the steps of these copies."""
-        steps = self._simulation.engine.matrix_steps(list(self._requested)).tolist()
-        there = [(s, step) for s, step in zip(self._requested.values(), steps, strict=True) if step >= 0]
+        steps = self._simulation.engine.matrix_steps(list(self._requested))
+        places = np.flatnonzero(steps >= 0)
+        if not len(places):
+            return []
+        states = list(self._requested.values())
+        there = [(states[k], step) for k, step in zip(places.tolist(), steps[places].tolist(), strict=True)]
         for state in [state for state, _ in there if state.job.copy is None]:  # sent, or given up
             del self._requested[state.body.index]
         return [each for each in there if each[0].job.copy is not None]

@@ -4,13 +4,14 @@
 import ctypes as c
 import subprocess
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from sim_server.backends.compiler import INCLUDE, SOURCES, compiler
 from sim_server.backends.cpu.structs import BALANCE
-from sim_server.backends.gpu.energies import ENERGY_BALANCE, SUMS, node_chunks, start_sums
+from sim_server.backends.gpu.energies import ENERGY_BALANCE, SUMS, node_chunks, start_balances
 from sim_server.backends.gpu.structs import ENERGY_RECORD
 
 G = np.array([0.3, -9.81, 2.0])
@@ -142,16 +143,26 @@ def test_what_has_too_much_goes_back_and_rests_and_nothing_else(library, on_runa
         assert not bodies.records[1]["kinetic"][:3].any()
 
 
-def test_sums_of_the_start_are_those_of_each_body_alone():
-    rng, sizes = np.random.default_rng(3), [1, 5, 40, 2, 17]
+@pytest.mark.parametrize("real", [np.float64, np.float32])
+def test_a_balance_begins_with_the_sums_of_its_own_body(real):
+    rng, sizes, dt = np.random.default_rng(3), [1, 5, 40, 2, 17], 0.01
     starts = np.concatenate([[0], np.cumsum(sizes)]).astype(np.int32)
-    mass, x, v = rng.uniform(1, 2, starts[-1]), rng.normal(size=(starts[-1], 3)), rng.normal(size=(starts[-1], 3))
-    found = start_sums(starts, mass, x, v, G, 0.01)
-    for row, own in zip(found, map(slice, starts[:-1], starts[1:]), strict=True):
-        extent = np.ptp(x[own], axis=0)
-        expected = [
-            0.5 * mass[own] @ (v[own] ** 2).sum(axis=1),
-            -mass[own] @ x[own] @ G,
-            0.01 * np.ptp(v[own], 0).max(),
-        ]
-        np.testing.assert_allclose(row, [*expected, np.linalg.norm(extent)], rtol=1e-13, atol=1e-13)
+    mass, shape = rng.uniform(1, 2, starts[-1]), (starts[-1], 3)
+    x, v = rng.normal(size=shape).astype(real), rng.normal(size=shape).astype(real)
+    balance = np.zeros(len(sizes), BALANCE)
+    balance["elastic"], balance["diagonal"], balance["mass"] = 7, 0.5, 3
+    untouched = balance.copy()
+    given = SimpleNamespace(starts=starts, mass=mass, gravity=G, inertia=True)
+    begun = np.array([0, 2, 3, 4])
+    start_balances(balance, begun, given, x, v, dt)
+    assert balance[1] == untouched[1]
+    for b in begun:
+        own = slice(starts[b], starts[b + 1])
+        at, speed = x[own].astype(float), v[own].astype(float)
+        kinetic, size = 0.5 * mass[own] @ (speed**2).sum(axis=1), max(0.5, np.linalg.norm(np.ptp(at, axis=0)))
+        expected = {
+            "kinetic": kinetic, "gravity": -mass[own] @ (at @ G), "start": kinetic + 7, "budget": kinetic + 7,
+            "floor": 1.5 * (1e-3 * size / dt) ** 2, "limit": 4 * size + 2 * dt * np.ptp(speed, axis=0).max(),
+        }  # fmt: skip
+        for name, value in expected.items():
+            assert balance[b][name] == pytest.approx(value, rel=1e-12, abs=1e-12), (b, name)

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: MIT
 """The parts of the GPU benchmark that need no GPU: scenes, rounds (on a CPU), counts of bytes, tables, merging."""
 
+import argparse
 import json
 import os
 import subprocess
@@ -183,3 +184,27 @@ def test_without_a_gpu_one_line_and_code_2(tmp_path: Path) -> None:
     result = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=60)
     assert result.returncode == 2 and result.stdout == ""
     assert result.stderr.startswith("bench gpu: ") and result.stderr.count("\n") == 1
+
+
+def test_what_was_measured_is_kept_when_a_later_scene_fails(monkeypatch: pytest.MonkeyPatch) -> None:
+    def failed() -> dict[str, gpu.Rows]:
+        raise RuntimeError("no memory")
+
+    scenes = [("one", lambda: {"steps": [{"tets": 540}], "others": []}), ("two", failed),
+              ("three", lambda: {"realtime": [{"tets": 24_000}]})]  # fmt: skip
+    monkeypatch.setattr(gpu, "scenes", lambda o: scenes)
+    monkeypatch.setattr("tests.bench.gpu.device.described", lambda: {"gpu": "none"})
+    monkeypatch.setattr("tests.bench.gpu.cudss.version", lambda: "absent")
+    kept: list[list[int]] = []
+    data = gpu.measure(argparse.Namespace(set=["a=1"]), lambda d: kept.append([len(d["steps"]), len(d["realtime"])]))
+    assert kept == [[1, 0], [1, 0], [1, 1]]
+    assert data["steps"] == [{"settings": "a=1", "tets": 540}] and data["device"]["cuDSS"] == "absent"
+
+
+def test_scenes_are_those_asked_for() -> None:
+    o = argparse.Namespace(
+        sizes=[540, 24_000], materials=["homogeneous"], beams=64, only=["steps", "batches", "realtime"]
+    )
+    names = [name for name, _ in gpu.scenes(o)]
+    single = ["1 x 540 tets, homogeneous", "1 x 24000 tets, homogeneous"]
+    assert names == [*single, "16 x 3000 tets, homogeneous", "64 x 3000 tets, homogeneous", "24000 tets in real time"]

@@ -7,9 +7,9 @@ import pytest
 
 from tests.bench.harness.report import ROOT
 from tests.bench.speed.__main__ import UNITS
-from tests.bench.speed.page import KEYS, summary
+from tests.bench.speed.page import KEYS, of_runs, summary
 from tests.bench.speed.targets import TARGETS
-from tests.bench.speed.turns import Side, percentiles
+from tests.bench.speed.turns import Side, in_turn, percentiles
 
 
 def row_of(unit: str) -> dict[str, Any]:
@@ -47,6 +47,37 @@ def test_a_row_tells_both_sides_and_whether_the_goal_is_met() -> None:
     large = {"what": "steps", "tets": 405_600, "material": "homogeneous", "beams": 1, "side": "after"}
     both = [{**large, **percentiles([4.0])}, {**large, "settings": "solver.gpus=2", **percentiles([2.0])}]
     assert [row["met"] for row in summary(both)] == [row["met"] for row in summary(both[::-1])] == ["no", "yes"]
+
+
+def test_a_gain_is_one_of_a_run() -> None:
+    batch = {"what": "steps", "tets": 3000, "material": "homogeneous", "beams": 256}
+    many = {"what": "many", "tets": 540, "beams": 512}
+    first = [
+        {**batch, "side": "before", "p50": 3.0, "p99": 4.0, "max": 5.0},
+        {**many, "side": "before", "factors/s": 20.0},
+        {**many, "side": "after", "factors/s": 900.0},
+    ]
+    second = [{**batch, "side": "after", "p50": 2.0, "p99": 4.0, "max": 5.0}]
+    parts = [{"data": {"rows": first}}, {"data": {"rows": second}}]
+    of_runs(parts)
+    rows = [row for part in parts for row in part["data"]["rows"]]
+    assert [row["run"] for row in rows] == [1, 1, 1, 2]
+    factors, steps = summary(rows)
+    assert (factors["gain"], factors["gain aimed at"]) == ("45 x", "33.3 x")
+    assert (steps["gain"], steps["gain aimed at"]) == ("–", "1.4 x"), "the machine of one run may be slower"
+    rows[-1]["run"] = 1
+    assert summary(rows)[1]["gain"] == "1.5 x"
+
+
+def test_a_side_that_fails_leaves_the_other() -> None:
+    def fails(what: str, **_: Any) -> dict[str, Any]:
+        raise RuntimeError("too old")
+
+    sides: Any = {"before": fails, "after": lambda what, **order: {"p50": order["seconds"]}}
+    found = in_turn(sides, "many", {"tets": 540}, seconds=2.0)
+    assert found == [{"what": "many", "tets": 540, "side": "after", "p50": 2.0}]
+    with pytest.raises(RuntimeError, match="before: too old"):
+        in_turn({"before": sides["before"]}, "many", {"tets": 540})
 
 
 def test_a_side_says_what_went_wrong_and_goes_on() -> None:

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Factors made on a GPU beside those of the CPU. Runs where there is a GPU: pytest -m gpu."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 import numpy as np
 import pytest
@@ -181,14 +181,32 @@ def test_the_factor_goes_where_it_is_wanted_and_stays_there():
     assert np.allclose(other, 2 * kept)
 
 
-def test_nothing_is_allocated_once_it_runs():
+@pytest.fixture
+def locked() -> Iterator[list[int]]:
+    """Bytes of each block of page-locked memory that is taken from now on, of an empty pool."""
+    from precond_worker.gpu.device import cupy
+
+    cuda, sizes = cupy().cuda, list[int]()
+
+    def lock(size):
+        sizes.append(size)
+        return cuda.PinnedMemoryPointer(cuda.PinnedMemory(size), 0)
+
+    pool = cuda.PinnedMemoryPool(lock)
+    cuda.set_pinned_memory_allocator(pool.malloc)
+    yield sizes
+    cuda.set_pinned_memory_allocator(cupy().get_default_pinned_memory_pool().malloc)
+
+
+def test_nothing_is_allocated_once_it_runs(locked):
+    """As in a worker, where a factor is sent while the next one is made."""
     from precond_worker.gpu.device import cupy
 
     cp = cupy()
     graph = GRAPHS["bar"]
     analysis = Analysis(*graph, "gpu")
     matrix = spd(*graph)
-    analysis.factorize(matrix)
+    analysis.make_ready()
     asked: list[int] = []  # bytes that this process asked its pool or the device for; others may work on the device
 
     class Hook(cp.cuda.MemoryHook):
@@ -200,14 +218,15 @@ def test_nothing_is_allocated_once_it_runs():
         def malloc_preprocess(self, **request):
             asked.append(request["mem_size"])
 
-    pinned = cp.get_default_pinned_memory_pool()
-    before = pinned.n_free_blocks()
+    before = locked.copy()
+    assert before, "the pool tells what it takes"
     with Hook():
         for _ in range(50):
-            analysis.factorize(matrix)
-        assert asked == [] and pinned.n_free_blocks() == before
+            sent = analysis.factorize(matrix)
+        assert asked == [] and locked == before
         cp.empty(1000)
     assert asked, "the hook hears of what this process allocates"
+    assert np.isfinite(sent).all()
 
 
 def test_too_little_memory_is_said_with_sizes_and_the_rest_goes_on(monkeypatch):

@@ -21,7 +21,7 @@ def test_the_same_bit_for_bit(worker: str, pace: str, tmp_path: Path) -> None:
     """
     steps = STEPS if pace == "--realtime" else 30_000 if worker == "cpu" else 8_000
     options = ("--device", "gpu", "--worker-device", worker, pace, "--steps", str(steps))
-    log = recorded(tmp_path, "", "cholesky", *options, patience=240)
+    log = recorded(tmp_path, 'first_factor = "wait"', "cholesky", *options, patience=240)
     touched = messages(log, "touch")
     assert len(touched) > 3 and touched[-1].step > touched[0].step, "the log says when the loop took them up"
     assert len({s.factor_step for s in messages(log, "step")}) > 10, "factors came from the worker all along"

@@ -170,6 +170,23 @@ def test_the_first_job_that_a_worker_assembles_may_take_its_time(leases: Leases)
     assert leases.lease("beam", "w", positions=True) == MIN_LEASE
 
 
+@pytest.mark.parametrize("method", ["cholesky", "incomplete"])
+def test_the_terms_of_many_jobs_are_those_of_each_alone(leases: Leases, method: str) -> None:
+    for seconds in (0.001, 0.4, 100.0):
+        leases.finish(sent(leases, f"after {seconds}"), seconds)
+    leases.finish(sent(leases, "at two", worker="other"), 0.3)
+    leases.finish(sent(leases, "at two"), 0.9)
+    leases.finish(sent(leases, "elsewhere", worker="other"), 0.3)
+    leases.finish(sent(leases, "late"), 0.4)
+    sent(leases, "late", deadline=0.0)
+    leases.expire(1.0)
+    names = ["after 0.001", "after 0.4", "after 100.0", "at two", "elsewhere", "late", "new"]
+    found = leases.terms([(name, 40_000) for name in names], "w", method)
+    expected = [leases.lease(name, "w", method) for name in names]
+    assert found == (expected, [leases.exclusive_period(name, 40_000) for name in names])
+    assert len(set(expected)) == (1 if method == "incomplete" else 5)
+
+
 def test_who_is_late_costs_others_no_time(leases: Leases) -> None:
     """Leases are of an object at a worker."""
     leases.finish(sent(leases, worker="good"), 0.4)

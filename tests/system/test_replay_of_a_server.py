@@ -35,13 +35,20 @@ Change = Callable[[Any], bool]  # of a message in place; False: leave it out
 
 
 def push_and_grab(client: Client) -> None:
-    """A push, a grab that is moved about, and a push during a pause."""
+    """A push, a grab that is moved about, and a push during a pause.
+
+    The last moves are each followed by a step, so that the loop takes up several sets at different steps, however slow
+    client and server are.
+    """
     client.push("beam", at=(0.5, 0.5, 4), force=(100, 0, 0), duration=0.3)
     with client.grab("beam", (1, 1, 4), stiffness=1e5, max_force=9000) as held:
         for k in range(25):
             held.move((1 + 0.02 * k, 1, 4))
             time.sleep(0.01)
         client.pause()
+        for k in range(6):
+            held.move((1.5, 1, 4 + 0.01 * k))
+            client.step()
         client.push("beam", at=(0, 0, 3), force=(0, 90, 0), duration=0.1)
         client.resume()
 
@@ -73,6 +80,7 @@ def recorded(
         with stage.client() as client:
             client.pause()
             until(lambda: preconditioner == "none" or fresh(client).workers, "the worker has joined")
+            client.step()  # in real time it waits for the first factor; all that a client does meanwhile would be one
             client.resume()
             touch(client)
         assert server.wait(patience) == 0, server.output()

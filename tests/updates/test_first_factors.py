@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from protocol.factor import Factor
+from sim_server.backends.base import Due
 from sim_server.simulation import Simulation
 from sim_server.updates.driver import Driver
 from sim_server.updates.factor_source import Inline, Job
@@ -153,6 +154,29 @@ def test_a_stop_ends_the_wait_within_the_step() -> None:
     workers.held = True
     first = FirstFactors(Driver(sim, workers), sleep=lambda seconds: setattr(sim.engine.loop, "stop", 1))
     assert not first.run() and not first.done and sim.engine.step == 0
+
+
+def test_single_steps_in_a_pause_from_before_the_first_one() -> None:
+    """The loop is not said to stand still before the first of them is over, and none is lost."""
+    sim = simulation(*BODIES, preconditioner="cholesky")
+    workers, loop = Workers(sim), sim.engine.loop
+    driver, workers.held = Driver(sim, workers), True
+    seen: list[tuple[int, int, int]] = []
+
+    def sleep(seconds: float) -> None:
+        seen.append((loop.halted, loop.single, sim.engine.step))
+        workers.held = False
+
+    loop.pause, loop.single = 1, 3
+    due = sim.engine.wait()
+    assert due is Due.SINGLE and loop.single == 2
+    assert FirstFactors(driver, sleep=sleep).run(due)
+    assert seen[0] == (0, 3, 0) and (loop.single, sim.engine.step) == (2, 1)
+    assert (sim.engine.wait(), loop.single) == (Due.SINGLE, 1)
+    loop.pause = 0
+    assert sim.engine.wait() is Due.NEXT
+    loop.stop = 1
+    assert sim.engine.wait() is Due.STOP
 
 
 def test_few_names() -> None:

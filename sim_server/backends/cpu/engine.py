@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from protocol.factor import Factor, FactorPattern
 from sim_server.arrays import Float64, Int32, Int64
-from sim_server.backends.base import ArrayChange, Capability, EngineInput, Launch
+from sim_server.backends.base import ArrayChange, Capability, Due, EngineInput, Launch
 from sim_server.backends.cpu import structs
 from sim_server.backends.cpu.contact import NativeContact
 from sim_server.backends.cpu.corrections import NativeCorrection, NativeCut, NativeRefresh
@@ -247,12 +247,9 @@ class CpuEngine(Reports):
         given = np.array(bodies, np.int32)
         self._native.wf_restart(c.byref(self.loop), given.ctypes.data, len(given))
 
-    def wait(self) -> bool:
-        """Sleeps until the next step is due (real time) and while paused, as `run` does before each step.
-
-        False if the loop is to stop.
-        """
-        return bool(self._native.wf_wait(c.byref(self.loop)))
+    def wait(self) -> Due:
+        """Sleeps until the next step is due (real time) and while paused, as `run` does before each step."""
+        return Due(self._native.wf_wait(c.byref(self.loop)))
 
     def settings(self, body: int) -> structs.SolveSettings:
         """Solver settings of a body; what is set holds from its next solve on."""
@@ -404,6 +401,10 @@ class CpuEngine(Reports):
 
     def copy_memory(self, body: int) -> None:
         """The loop copies to where it is told."""
+        return None
+
+    def request_matrices(self, bodies: Sequence[int]) -> None:
+        """Does nothing, as there is no such memory."""
         return None
 
     def stage(self, changes: Sequence[ArrayChange]) -> list[ArrayChange]:

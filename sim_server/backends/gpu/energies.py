@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_server.arrays import Float64, Int32
+from sim_server.arrays import Int32, Int64
 from sim_server.backends.declarations import Declarations
 from sim_server.backends.energies import CODES, Energies
 from sim_server.backends.gpu.cupy_types import DeviceArray, KernelFunction
@@ -154,15 +154,13 @@ class DeviceEnergies:
         e = self._energies
         self.launch_elastic()
         self._settled[:] = self._counter
-        x, v = (self._gpu.twin(array).get().astype(float) for array in (e.x, e.v))
+        x, v = (self._gpu.twin(array).get() for array in (e.x, e.v))
         balance = np.frombuffer(self._balance.get().tobytes(), BALANCE).copy()
         starts = np.arange(len(balance)) if bodies is None else np.array(bodies, np.int64)
         balance["elastic"][starts] = self._sum.get()[starts]
         if bodies is not None:
             balance["phase"][starts] = 0  # WELL
-        sums = np.ascontiguousarray(start_sums(e.starts, e.mass, x, v, e.gravity, self._dt))
-        arrays = starts.ctypes.data, balance.ctypes.data, sums.ctypes.data
-        library().wf_gpu_start_balances(len(starts), *arrays, self._dt, int(e.inertia))
+        start_balances(balance, starts, e, x, v, self._dt)
         self._balance.set(np.frombuffer(balance.tobytes(), np.uint8))
         self.started = True
 
@@ -184,17 +182,16 @@ def node_chunks(starts: Int32, nodes: int) -> NDArray[Any]:
     return chunks
 
 
-def start_sums(
-    starts: Int32, mass: Float64, x: Float64, v: Float64, gravity: Float64, dt: float
-) -> Float64:  # fmt: skip
-    """Returns of each body kinetic and potential energy [J], the largest difference of dt v along an axis [m] and the
-    diagonal [m], (bodies, 4).
+def start_balances(
+    balance: NDArray[Any], bodies: Int64, e: Energies, x: NDArray[Any], v: NDArray[Any], dt: float
+) -> None:
+    """Starts the balances (BALANCE) of some bodies in a state; `elastic` and `diagonal` are set already.
 
-    starts: (bodies + 1,), first node of each. mass: (n,) [kg]. x, v: (n, 3) [m], [m/s]. gravity: (3,) [m/s2]. dt [s].
+    x, v: (n, 3) [m], [m/s], of type float64 or float32. dt [s]
     """
-    first, axes = starts[:-1], [np.ascontiguousarray(each.T) for each in (x, v)]  # along which NumPy is twice as fast
-    low, high = ([f.reduceat(each, first, axis=1) for each in axes] for f in (np.minimum, np.maximum))
-    extent_x, extent_v = (most - least for most, least in zip(high, low, strict=True))
-    half_square = 0.5 * (axes[1][0] ** 2 + axes[1][1] ** 2 + axes[1][2] ** 2)
-    kinetic, potential = (np.add.reduceat(mass * each, first) for each in (half_square, -(x @ gravity)))
-    return np.column_stack([kinetic, potential, dt * extent_v.max(axis=0), np.linalg.norm(extent_x, axis=0)])
+    mass, gravity = (np.ascontiguousarray(each, np.float64) for each in (e.mass, e.gravity))
+    bodies, nodes = np.ascontiguousarray(bodies, np.int64), np.ascontiguousarray(e.starts, np.int32)
+    x, v = (np.ascontiguousarray(each, np.result_type(x, v)) for each in (x, v))
+    arrays = (each.ctypes.data for each in (bodies, balance, nodes, mass, x, v))
+    single, inertia = int(x.dtype == np.float32), int(e.inertia)
+    library().wf_gpu_start_balances(len(bodies), *arrays, single, gravity.ctypes.data, dt, inertia)

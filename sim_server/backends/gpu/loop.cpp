@@ -12,6 +12,7 @@
 
 #include "../cpu/native/pair_wrenches.h"
 #include "../cpu/native/sizes.h"
+#include "../cpu/native/start_of_balance.h"
 #include "readback.h"
 #include "step_form.h"
 
@@ -275,7 +276,7 @@ static bool finish_down_to(GpuLoop& l, int64_t under_way) {
 }
 
 // Waits until the next step is due, and finishes batches and copies under way meanwhile.
-static bool wait(GpuLoop& l) {
+static Due wait(GpuLoop& l) {
     return wait_until_due(l.rings, [&] {
         if (finish_down_to(l, 0)) publish(l);
         return l.matrix_step >= 0 || l.rings.frame_head.load() < l.frames_begun;
@@ -332,16 +333,14 @@ Mail* wf_gpu_post(GpuLoop* loop, MailSlot* slot, Mail* mail) {
     return before;
 }
 
-// Starts the balances of some bodies. sums: of each body kinetic and potential energy [J], largest difference of dt v [m], diagonal [m].
-void wf_gpu_start_balances(int64_t count, const int64_t* bodies, Balance* balance, const double* sums, double dt, int32_t inertia) {
+// Starts the balances of some bodies. starts: first node of each and the end of the last one. mass: of the nodes [kg]. x, v: of type
+// double, or float where `single`. dt [s].
+void wf_gpu_start_balances(int64_t count, const int64_t* bodies, Balance* balance, const int32_t* starts, const double* mass, const void* x,
+                           const void* v, int32_t single, const double* gravity, double dt, int32_t inertia) {
     for (int64_t k = 0; k < count; ++k) {
-        const double* own = sums + 4 * bodies[k];
-        Sums s = no_sums();
-        s.kinetic = own[0];
-        s.gravity = own[1];
-        s.low[0] = 0;
-        s.high[0] = own[2];
-        start_balance(balance[bodies[k]], s, own[3], dt, inertia);
+        const int64_t body = bodies[k], first = starts[body], last = starts[body + 1];
+        if (single) begin_balance(balance[body], first, last, mass, (const float*)x, (const float*)v, gravity, dt, inertia);
+        else begin_balance(balance[body], first, last, mass, (const double*)x, (const double*)v, gravity, dt, inertia);
     }
 }
 

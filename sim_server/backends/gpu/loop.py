@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from sim_server.arrays import Float64, Int64
+from sim_server.backends.base import Due
 from sim_server.backends.gpu import structs
 from sim_server.backends.gpu.mailbox import DeviceMailbox, library
 from sim_server.backends.gpu.structs import FRAME_COPIES, RECORD_TARGET
@@ -118,6 +119,7 @@ class DeviceLoop(Reports):
         self._doubled = places == 2
         staged = np.cumsum([0, *(places * room for room in self._room)])
         self._staged_begin = [int(begin) for begin in staged]  # of the first one of each
+        self._first_places, self._rooms = staged[:-1].astype(np.int64), np.array(self._room, np.int64)
         for entry, (first, last), own in zip(self._readbacks, ranges, staged, strict=False):
             begin, end = block * int(row_start[first]), block * int(row_start[last])
             entry.values_begin, entry.values_bytes, entry.copied_step = begin, end - begin, -1
@@ -224,9 +226,9 @@ class DeviceLoop(Reports):
         self._check()
         return done
 
-    def wait(self) -> bool:
-        """Sleeps while paused and, in real time, until the next step is due; False if the loop is to stop."""
-        return bool(self._native.wf_gpu_wait(c.byref(self.loop)))
+    def wait(self) -> Due:
+        """Sleeps while paused and, in real time, until the next step is due."""
+        return Due(self._native.wf_gpu_wait(c.byref(self.loop)))
 
     def open_step(self) -> None:
         """Begins a step whose kernels the caller launches."""
@@ -272,9 +274,28 @@ class DeviceLoop(Reports):
     def copy_memory(self, body: int) -> Float64 | None:
         """Returns page-locked memory that the next copy of a body's matrix is brought to, (blocks, 3, 3), and that the
         one behind it leaves alone; None: where matrices are large, or of another type."""
-        if self._real != np.float64 or not self._doubled:
+        return self._memory_at(body, self._other_place(body)) if self._has_copy_memory else None
+
+    def request_matrices(self, bodies: Sequence[int]) -> list[Float64] | None:
+        """Requests the matrices of some bodies, each as `request_matrix` does for its `copy_memory`, and returns that
+        memory; None, and requests none: where there is no such memory."""
+        if not self._has_copy_memory:
             return None
-        place = self._other_place(body)
+        self._staging()
+        rows = np.array(bodies, np.int64)
+        places = self._other_places(rows)
+        self._staged_at[rows] = places
+        self._copied_steps[rows] = -1
+        self._requests[rows] = structs.REQUEST_VALUES  # last, as in `_request`
+        self.loop.requested = 1
+        return [self._memory_at(body, place) for body, place in zip(bodies, places.tolist(), strict=True)]
+
+    @property
+    def _has_copy_memory(self) -> bool:
+        return self._doubled and self._real == np.float64
+
+    def _memory_at(self, body: int, place: int) -> Float64:
+        """Returns the memory of copies of a body's matrix from byte `place` on."""
         if (own := self._own_memory.get(place)) is None:
             memory = self._staging()[place : place + self._room[body]]
             own = self._own_memory[place] = memory.view(np.float64).reshape(-1, 3, 3)
@@ -284,6 +305,12 @@ class DeviceLoop(Reports):
         """First byte of the place for a copy that the last one was not brought to: who has that may still read it."""
         begin = self._staged_begin[body]
         return begin + self._room[body] if self._staged_at[body] == begin else begin
+
+    def _other_places(self, bodies: Int64) -> Int64:
+        """Returns the same of each of some bodies."""
+        begin = self._first_places[bodies]
+        places: Int64 = np.where(self._staged_at[bodies] == begin, begin + self._rooms[bodies], begin)
+        return places
 
     def prepare_copies(self) -> None:
         """Makes the memory of copies, which is page-locked: while it is made all calls to CUDA wait."""

@@ -24,7 +24,7 @@ def library() -> c.CDLL:
             "wf_gpu_open": (c.c_int32, [loop]), "wf_gpu_renew": (c.c_int32, [loop]),
             "wf_gpu_close": (c.c_int32, [loop]), "wf_gpu_post": (p, [loop, c.POINTER(structs.MailSlot), p]),
             "wf_gpu_post_changes": (p, [loop, p]), "wf_gpu_take_changes": (c.c_int32, [loop]),
-            "wf_gpu_start_balances": (None, [c.c_int64, p, p, p, c.c_double, c.c_int32]),
+            "wf_gpu_start_balances": (None, [c.c_int64, *[p] * 6, c.c_int32, p, c.c_double, c.c_int32]),
         },
     )  # fmt: skip
     structs.LOOP.check_sizes(compiled)

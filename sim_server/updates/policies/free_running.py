@@ -101,8 +101,7 @@ class Async(UpdatePolicy):
         # Request their matrices; in advance only those of bodies that need a factor
         states = [driver.bodies[body] for body in chosen]
         wanted = states[:idle] + [s for s in states[idle:] if s.job.sent is None or s.solves.excess > 0]
-        for state in wanted:
-            driver.snapshots.request(state)
+        driver.snapshots.request_all(wanted)
         if len(wanted) < places:
             self._exhausted = step
 

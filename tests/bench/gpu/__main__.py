@@ -14,12 +14,15 @@ import argparse
 import json
 import sys
 import time
+from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from sim_server.errors import DeviceError
 from tests.bench.gpu import page
 from tests.bench.gpu.problem import BARS, BATCHES, MATERIALS, Problem
+from tests.bench.harness.pieces import Piece
 from tests.bench.harness.report import Report
 
 SECTIONS = ("steps", "batches", "others", "served", "realtime", "linearizations")
@@ -28,6 +31,7 @@ ROUNDS = {540: 20, 3000: 20, 7350: 20, 24_000: 12, 98_304: 6, 405_600: 3, 1_029_
 WITHOUT = {540: 4, 3000: 4, 7350: 2, 24_000: 2, 98_304: 2, 405_600: 1, 1_029_000: 1}  # steps of CG in each round
 
 Rows = list[dict[str, Any]]
+Data = dict[str, Any]
 
 
 class Page(Report):
@@ -45,7 +49,7 @@ class Page(Report):
 TITLE = "A step on a GPU"
 
 
-def beams(problem: Problem, o: argparse.Namespace, external: bool) -> tuple[Rows, Rows]:
+def beams(problem: Problem, o: argparse.Namespace, external: bool) -> dict[str, Rows]:
     """Row of one scene, rows of others on its last matrix."""
     from tests.bench.gpu.others import compared
     from tests.bench.gpu.rows import row
@@ -64,7 +68,20 @@ def beams(problem: Problem, o: argparse.Namespace, external: bool) -> tuple[Rows
         del scene, found  # their memory
         others = compared(sample, problem.tets, problem.material, 10 if o.quick else 50)
     print(f"{problem.name}: {ready - begin:.1f} s to load, {time.perf_counter() - ready:.1f} s", flush=True)
-    return rows, others
+    return {"steps": rows, "others": others}
+
+
+def with_workers(problem: Problem, o: argparse.Namespace) -> dict[str, Rows]:
+    """Rows with each kind of worker, and with matrices leaving."""
+    from tests.bench.gpu.served import measure as served
+
+    rows, publishing = served(problem, 1.0, overrides=tuple(o.set))
+    return {"served": rows, "publishing": publishing}
+
+
+def searched(tets: int, o: argparse.Namespace) -> dict[str, Rows]:
+    """Rows with several linearizations, and of what it takes to know that one is enough."""
+    return {"linearizations": searches(tets, o), "trial": trial(tets, o)}
 
 
 def searches(tets: int, o: argparse.Namespace) -> Rows:
@@ -90,62 +107,57 @@ def trial(tets: int, o: argparse.Namespace) -> Rows:
     return [found]
 
 
-def in_real_time(tets: int, o: argparse.Namespace) -> dict[str, Any]:
+def in_real_time(tets: int, o: argparse.Namespace) -> dict[str, Rows]:
     """Row of a server in real time with a worker on the same GPU."""
     from tests.bench.gpu.first_factor import measure as real_time
 
     row = real_time(tets, seconds=2.0 if o.quick else 4.0, dt=REAL_DT)
     print(row, flush=True)
-    return row
+    return {"realtime": [row]}
 
 
-def measure(o: argparse.Namespace) -> dict[str, Rows]:
-    """All sections asked for, and what the device is."""
+def measure(o: argparse.Namespace, keep: Callable[[Data], None]) -> Data:
+    """All sections asked for, and what the device is. keep: gets what there is so far after each scene."""
     from tests.bench.gpu.cudss import version
     from tests.bench.gpu.device import described
-    from tests.bench.gpu.served import SIZES
-    from tests.bench.gpu.served import measure as served
-    from tests.bench.gpu.steps import SEARCHED
 
-    data: dict[str, Any] = {name: [] for name in page.KEYS}
+    data: Data = {name: [] for name in page.KEYS}
     data["device"] = described() | {"cuDSS": version()}
     print(data["device"], flush=True)
+    for name, run in scenes(o):
+        for section, rows in guarded(name, run).items():
+            data[section] += [{"settings": " ".join(o.set), **row} for row in rows]
+        keep(data)
+    return data
+
+
+def scenes(o: argparse.Namespace) -> Iterator[tuple[str, Callable[[], dict[str, Rows]]]]:
+    """Name of each scene asked for, and what measures it: rows of sections."""
+    from tests.bench.gpu.served import SIZES
+    from tests.bench.gpu.steps import SEARCHED
+
     problems = [Problem(tets, m) for tets in o.sizes for m in o.materials] if {"steps", "others"} & {*o.only} else []
     if "batches" in o.only:
         problems += [Problem(tets, MATERIALS[0], n) for n, tets in BATCHES if 1 < n <= o.beams]
     for problem in problems:
         external = problem.beams == 1 and problem.material == MATERIALS[0] and "others" in o.only
-        steps, others = guarded(problem.name, lambda: beams(problem, o, external))  # noqa: B023
-        data["steps"] += steps
-        data["others"] += others
-    if "served" in o.only:
-        for tets in (t for t in o.sizes if t in SIZES):
-            for material in o.materials:
-                problem = Problem(tets, material)
-                rows, publishing = guarded(problem.name, lambda: served(problem, 1.0, overrides=tuple(o.set)))  # noqa: B023
-                data["served"] += rows
-                data["publishing"] += publishing
-    for tets in o.sizes if "realtime" in o.only else ():
-        if tets in REAL_TIME:
-            rows, _ = guarded(f"{tets} tets in real time", lambda: ([in_real_time(tets, o)], []))  # noqa: B023
-            data["realtime"] += rows
-    for tets in o.sizes if "linearizations" in o.only else ():
-        if tets in SEARCHED:
-            made = guarded(f"{tets} tets", lambda: (searches(tets, o), trial(tets, o)))  # noqa: B023
-            data["linearizations"] += made[0]
-            data["trial"] += made[1]
-    for section in page.KEYS:
-        data[section] = [{"settings": " ".join(o.set), **row} for row in data[section]]
-    return data
+        yield problem.name, partial(beams, problem, o, external)
+    for tets in (t for t in o.sizes if "served" in o.only and t in SIZES):
+        for problem in (Problem(tets, material) for material in o.materials):
+            yield problem.name, partial(with_workers, problem, o)
+    for tets in (t for t in o.sizes if "realtime" in o.only and t in REAL_TIME):
+        yield f"{tets} tets in real time", partial(in_real_time, tets, o)
+    for tets in (t for t in o.sizes if "linearizations" in o.only and t in SEARCHED):
+        yield f"{tets} tets", partial(searched, tets, o)
 
 
-def guarded(name: str, run: Any) -> tuple[Rows, Rows]:
+def guarded(name: str, run: Callable[[], dict[str, Rows]]) -> dict[str, Rows]:
     """What `run` returns; where it fails, a line that says so, and nothing, so that the rest goes on."""
     try:
         return run()
     except Exception as error:
         print(f"FAILED {name}: {type(error).__name__}: {error}", file=sys.stderr, flush=True)
-        return [], []
+        return {}
 
 
 def merge(files: list[Path], out: Path | None) -> None:
@@ -202,8 +214,13 @@ def main() -> None:
         raise SystemExit(2) from None
     words = {k: getattr(o, k) for k in ("only", "sizes", "materials", "beams", "library")}
     words |= {k: getattr(o, k) for k in ("set", "quick") if getattr(o, k)}
-    report = Report("gpu", TITLE, words, o.out, o.quick)
-    page.write(report, page.merged([measure(o)]))
+    report = Piece("gpu", TITLE, words, o.out, o.quick)
+
+    def keep(data: Data) -> None:
+        report.data |= page.merged([data])
+        report.keep()
+
+    page.write(report, page.merged([measure(o, keep)]))
 
 
 if __name__ == "__main__":

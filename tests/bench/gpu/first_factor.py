@@ -61,8 +61,17 @@ def served(scene: Path, first: str, device: str, worker: str, seconds: float, dt
         row = _watched(endpoint, seconds, dt, started)
         return {"new in caches": len(_kept() - kept), **row}
     finally:
-        server.terminate()
-        server.wait(30)
+        ended(server)
+
+
+def ended(server: subprocess.Popen[bytes], patience: float = 30.0) -> None:
+    """Ends a server; kills it where it does not end within `patience` seconds, as older ones that plan an inverse."""
+    server.terminate()
+    try:
+        server.wait(patience)
+    except subprocess.TimeoutExpired:
+        server.kill()
+        server.wait()
 
 
 def _kept() -> set[Path]:

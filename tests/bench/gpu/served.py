@@ -48,6 +48,7 @@ class Served:
         self.sim, self.engine, self._worker = sim, sim.engine, worker
         self._start = sim.fetch().x.copy()
         self._endpoint = free_endpoint()
+        self._on_device: Any = None  # where it begins
         self._ended = False
 
     def __enter__(self) -> Self:
@@ -75,8 +76,19 @@ class Served:
             self._put_back()
 
     def _put_back(self) -> None:
-        put(self.sim, self.sim.world.x, self._start)
-        put(self.sim, self.sim.world.v, 0.0)
+        """Puts x and v back, on a GPU by copies within the device: what comes from the host takes as long as steps."""
+        world, backend = self.sim.world, self.sim.world.backend
+        if backend.name != "gpu":
+            put(self.sim, world.x, self._start)
+            put(self.sim, world.v, 0.0)
+            return
+        twins = backend.twin(world.x), backend.twin(world.v)
+        if self._on_device is None:
+            self._on_device = backend.cp.asarray(self._start.astype(twins[0].dtype))
+        twins[0][...] = self._on_device
+        twins[1].fill(0)
+        self.engine.restart_energy()
+        backend.cp.cuda.get_current_stream().synchronize()
 
     def helped(self, seconds: float) -> NDArray[Any]:
         """Records of `seconds` with factors coming and going; it begins half a second after the first."""

@@ -41,7 +41,8 @@ class Merged(Report):
         self._given, self.quick = last["header"], bool(last["arguments"].get("quick"))
         if several:
             self.say("Put together of several runs, the last one described above:")
-            self.table([_told(part) for part in self.parts])
+            told = [{"run": number, **_told(part)} for number, part in enumerate(self.parts, 1)]
+            self.table(told, list(dict.fromkeys(name for row in told for name in row)))
 
     def header(self) -> Row:
         """As given."""

@@ -29,8 +29,8 @@ BATCH_ROUNDS, LONG = 4, 256  # of many beams; steps without a pause
 QUICK = ("threads:540:2", "sofa:540", "steps:540", "real_time:540", "many:540:2", "swinging:540:2", "vbd:540")
 UNITS = (
     "threads:24000", "threads:98304", "sofa:540", "sofa:3000", "sofa:7350", "sofa:24000", "steps:24000",
-    "steps:24000:heterogeneous", "steps:98304", "steps:405600", "steps:1029000", "steps:540:512", "steps:3000:256",
-    "real_time:24000", "real_time:98304", "many:540:512", "many:540:1024",
+    "steps:24000:heterogeneous", "steps:98304", "steps:405600", "steps:1029000", "steps:540:512", "steps:540:1024",
+    "steps:3000:256", "real_time:24000", "real_time:98304", "many:540:512", "many:540:1024",
     "swinging:540:512", "swinging:540:1024", "vbd:3000",
 )  # fmt: skip
 DT, VBD_DT = 0.03, 0.02  # s, of steps in real time; of the scene of Newton's VBD
@@ -105,6 +105,7 @@ def main() -> None:
     o = options()
     if o.merge:
         merged = Merged("speed", TITLE, o.merge, o.out)
+        page.of_runs(merged.parts)
         page.write(merged, merged.rows("rows", page.KEYS))
         return
     checkouts = dict(zip(SIDES, (o.other, ROOT), strict=True)) if o.other else {SIDES[1]: ROOT}

@@ -11,7 +11,7 @@ import numpy as np
 
 from clients.client import Client
 from protocol import messages_pb2 as pb
-from tests.bench.gpu.first_factor import PATIENCE, answering, client_of
+from tests.bench.gpu.first_factor import PATIENCE, answering, client_of, ended
 from tests.ports import free_endpoint
 
 LOOKS = 8  # statuses in the time measured
@@ -30,8 +30,7 @@ def served(scene: Path, device: str, worker: str, seconds: float, first: float) 
             answering(client)
             return _watched(client, seconds, min(first, PATIENCE))
     finally:
-        server.terminate()
-        server.wait(30)
+        ended(server)
 
 
 def _status(client: Client) -> pb.Status:

@@ -136,11 +136,12 @@ def steps(
         sides, "load", name="beam", text=problem.text(), overrides=[], device=device
     ).items():
         say(f"{name}: {problem.name} loaded in {answer['seconds']:.1f} s")
+    order = {"name": "beam", "library": library, "variants": problem.variants, "steps": AGE}
+    everywhere(sides, "round", **order)  # warms up; what is made once a topology takes seconds
     found: dict[str, list[Row]] = {name: [] for name in sides}
-    for k in range(rounds + 1):
+    for _ in range(rounds):
         for name, side in sides.items():
-            answer = side("round", name="beam", library=library, variants=problem.variants, steps=AGE)
-            found[name] += [answer] if k else []  # the first one warms up
+            found[name].append(side("round", **order))
     runs = {name: [side("run", name="beam", steps=long)] if long else found[name] for name, side in sides.items()}
     everywhere(sides, "drop", name="beam")
     label = {"what": "steps", "tets": problem.tets, "material": problem.material, "beams": problem.beams}
@@ -172,5 +173,14 @@ def motion(sides: Sides, label: Row, text: str, ours: list[str], exact: list[str
 
 
 def in_turn(sides: Sides, what: str, label: Row, **order: Any) -> list[Row]:
-    """A measurement with servers, of one side after the other."""
-    return [{"what": what, **label, "side": name, **side(what, **order)} for name, side in sides.items()]
+    """A measurement with servers, of one side after the other; raises RuntimeError if it failed on each."""
+    rows, failed = list[Row](), list[str]()
+    for name, side in sides.items():
+        try:
+            rows.append({"what": what, **label, "side": name, **side(what, **order)})
+        except RuntimeError as error:
+            failed.append(f"{name}: {error}")
+            say(f"FAILED {what} {failed[-1]}")
+    if not rows:
+        raise RuntimeError("; ".join(failed))
+    return rows

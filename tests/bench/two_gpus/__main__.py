@@ -18,6 +18,7 @@ import numpy as np
 
 from sim_server.errors import InputError
 from tests.bench.gpu.problem import BARS, Problem
+from tests.bench.harness.pieces import Piece
 from tests.bench.harness.report import Report
 
 TITLE = "One body on two GPUs"
@@ -128,11 +129,14 @@ def main() -> None:
         raise SystemExit(2) from None
     from tests.bench.gpu.device import described
 
-    report, rows = Report("two_gpus", TITLE, {"sizes": o.sizes, "rounds": o.rounds}, o.out), list[Row]()
+    report, device = Piece("two_gpus", TITLE, {"sizes": o.sizes, "rounds": o.rounds}, o.out), described()
+    rows = list[Row]()
     for tets in o.sizes:
         rows += compared(tets, o.rounds, o.library)
         print(*rows[-2:], sep="\n", flush=True)
-    write(report, {"device": described(), "rows": rows})
+        report.data |= {"device": device, "rows": rows}
+        report.keep()
+    write(report, {"device": device, "rows": rows})
 
 
 if __name__ == "__main__":

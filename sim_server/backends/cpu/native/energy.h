@@ -5,6 +5,7 @@
 #include <cstring>
 
 #include "loop.h"
+#include "start_of_balance.h"
 
 // Sums over a body's nodes. keeps: what pushes and grabs exert stays, for another call.
 static Sums sums_of(const Loop& loop, const Body& body, bool keeps = false) {
@@ -46,19 +47,7 @@ static bool was_set(const Loop& loop, const Body& body) {
 
 static void begin_balance(const Loop& loop, const Body& body, Balance& balance) {
     const Energies& e = *loop.energies;
-    const double dt = loop.rings.dt;
-    Sums s = no_sums();
-    double low[3] = {INFINITY, INFINITY, INFINITY}, high[3] = {-INFINITY, -INFINITY, -INFINITY}, size = 0;
-    for (int i = body.first; i < body.last; ++i) {
-        const double *x = loop.x + 3 * i, *v = loop.v + 3 * i, step[3] = {dt * v[0], dt * v[1], dt * v[2]};
-        add_node(s, e.mass[i], x, v, step, e.gravity);
-        for (int c = 0; c < 3; ++c) {
-            low[c] = std::fmin(low[c], x[c]);
-            high[c] = std::fmax(high[c], x[c]);
-        }
-    }
-    for (int c = 0; c < 3; ++c) size += square(high[c] - low[c]);
-    start_balance(balance, s, std::sqrt(size), dt, e.inertia);
+    begin_balance(balance, body.first, body.last, e.mass, loop.x, loop.v, e.gravity, loop.rings.dt, e.inertia);
 }
 
 // Begins the balance of bodies before the first step, and of those whose state was set.

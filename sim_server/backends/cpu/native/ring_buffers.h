@@ -130,11 +130,13 @@ static int64_t begin_frame(Rings& rings, int64_t head, int64_t step, Meanwhile m
     return head % rings.frame_capacity;
 }
 
-// Before a step: stand still on request, sleep while paused and until it is due. False if the loop is to stop. `meanwhile` is called
+enum Due { DUE_STOP, DUE_NEXT, DUE_SINGLE };  // no step, one of a run, one of those that are made in a pause (base.py)
+
+// Before a step: stand still on request, sleep while paused and until it is due. `meanwhile` is called
 // before each nap and says whether it wants to be called again soon. A request to stand still is followed once nothing is under way;
 // what it changes may make the next step late, which the record tells.
 template <class Meanwhile>
-static bool wait_until_due(Rings& rings, Meanwhile meanwhile) {
+static Due wait_until_due(Rings& rings, Meanwhile meanwhile) {
     while (!rings.stop.load()) {
         const int64_t request = rings.hold.load();
         const int32_t pause = rings.single.load() <= 0 ? rings.pause.load() : 0;
@@ -148,7 +150,8 @@ static bool wait_until_due(Rings& rings, Meanwhile meanwhile) {
         nap(request ? 1e-4 : 1e-3);
     }
     rings.halted.store(0);  // before `single` says that no step is left
-    if (rings.pause.load() && rings.single.load() > 0) rings.single.fetch_sub(1);
+    const bool single = rings.pause.load() && rings.single.load() > 0;
+    if (single) rings.single.fetch_sub(1);
     rings.late = 0;
     if (rings.realtime && !rings.stop.load()) {
         double t = now();
@@ -161,5 +164,5 @@ static bool wait_until_due(Rings& rings, Meanwhile meanwhile) {
         if (rings.late > rings.dt) { ++rings.late_steps; rings.deadline = t; }  // do not chase lost time
         rings.deadline += rings.dt;
     }
-    return !rings.stop.load();
+    return rings.stop.load() ? DUE_STOP : single ? DUE_SINGLE : DUE_NEXT;
 }
