@@ -4,23 +4,15 @@
 import numpy as np
 import pytest
 
-from sim_server.backends.gpu import row_partition
 from sim_server.backends.gpu.row_partition import ROW_RANGE
 from tests.backends.pcg_on_threads import SOLVE, Solver, compiled, steps
 from tests.backends.test_gpu_correction import grabbed, hold
 from tests.scenes import bar, simulation
 
 
-@pytest.fixture(
-    scope="module", params=[(8,), (4,), (4, "LEAN_WORDS", "HALF_WARPS"), (2, "LEAN_WORDS", "COPIED_BY=16", "SPLIT_SUMS", "AHEAD=2"), (8, "SPLIT_SUMS"), (4, "SPLIT_SUMS")]
-)  # rows of a warp at a time, and more
-def library(request, tmp_path_factory):
-    rows, *more = request.param
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(row_partition, "warp_rows", lambda warps: rows)
-        if "AHEAD=2" in more:
-            patch.setattr(row_partition, "AHEAD", 2)
-        yield compiled(tmp_path_factory.mktemp("alone"), SOLVE, "ALONE", f"WARP_ROWS={rows}", *more)
+@pytest.fixture(scope="module")
+def library(tmp_path_factory):
+    return compiled(tmp_path_factory.mktemp("alone"), SOLVE, "ALONE")
 
 
 def solved(library, monkeypatch, shared: int | None = None, window: int | None = None):

@@ -35,9 +35,7 @@ extern "C" void apply(const PcgBody* body, const DevicePlan* plan, float alpha, 
         inverse.fetch();
         for (int k = threadIdx.x; k < plan->size + PADDING; k += THREADS) {  // where they are not in shared memory
             inverse.residual[k] = body->residual[k];
-#ifndef LEAN_WORDS
             inverse.product[k] = body->product[k];
-#endif
         }
         __syncthreads();
         ResidualSource from = {inverse.residual, 1, 2, alpha};
@@ -81,9 +79,6 @@ ASSEMBLY = {  # bodies of functions whose text is for a GPU alone
     "shared_address": "return (unsigned)((const char*)p - shared_memory);",
     "shared_vector_load": "return *(const uint4*)(shared_memory + from);",
     "shared_pair_load": "return wanted ? *(const uint2*)(shared_memory + from) : uint2{};",
-    "chunk_load": "return from[32 * K];",
-    "chunk_policy": "return 0;",
-    "prefetch_chunks": "",
     "multiply_add": "matrix_product(sum, a0, a1, a2, a3, b0, b1);",
 }
 MATRIX = """
@@ -193,26 +188,14 @@ def applied(library: c.CDLL, p: Plan, s: Any, shared: int, alone: bool, alpha: f
     return (z if alone else z["value"])[at].astype(float), float(zr.sum())
 
 
-CASES = {
-    "plain": (), "lean": ("LEAN_WORDS", "UNDER_WAY=2", "CHUNKS_AT_ONCE=2"),
-}  # fmt: skip
-
-
 @pytest.fixture(scope="module", params=["several", "alone"])
 def form(request):
     return request.param
 
 
-@pytest.fixture(scope="module", params=CASES)
-def library(request, form, tmp_path_factory):
-    defined = CASES[request.param]
-    if form != "alone" and "LEAN_WORDS" in defined:
-        pytest.skip("several exchange what lean words leave out")
-    if form == "alone":
-        defined = (*defined, "ALONE")
-    made = compiled(tmp_path_factory.mktemp("inverse"), *defined)
-    made.alpha = 0.0 if "LEAN_WORDS" in defined else 0.5
-    return made
+@pytest.fixture(scope="module")
+def library(form, tmp_path_factory):
+    return compiled(tmp_path_factory.mktemp("inverse"), *(["ALONE"] if form == "alone" else []))
 
 
 @pytest.fixture(scope="module")
@@ -229,7 +212,7 @@ def test_z_is_that_of_numpy(library, form, problem, groups, planes, near):
     sizes = np.unique(tree.size).tolist()
     thresholds = tuple(sizes[k * len(sizes) // groups] for k in range(1, groups))
     p = lay_out(tree, thresholds, 1 if alone else 3, planes)
-    z, zr = applied(library, p, s, 120_000 if near else 30_000, alone, library.alpha)
+    z, zr = applied(library, p, s, 120_000 if near else 30_000, alone, 0.5)
     within = 2e-3 if planes == 1 else 3e-6
     assert np.linalg.norm(z - s.z) <= within * np.linalg.norm(s.z)
     assert abs(zr - s.r @ z) <= 1e-5 * abs(s.r @ z)

@@ -36,8 +36,6 @@
 #include "smoothing_state.cuh"
 #endif
 
-// -DLEAN_WORDS, with -DALONE: d r is written once, after the update, and a barrier stands before it is read; nothing else is exchanged of
-// r and A p. So twice as many words find room in shared memory.
 #ifdef ALONE
 #define HELD &
 #else
@@ -50,7 +48,7 @@ struct BlockMemory {  // static shared memory of a thread block: data that is th
     DevicePlan plan;
     BlockRows rows;
     PartitionedInverse inverse;
-    Scale* d;                      // (own, 3) scale of the own degrees of freedom, or null
+    real* d;                       // (own, 3) scale of the own degrees of freedom, or null
     real* diagonal;                // (own, 9) inverses of the diagonal blocks
     double peak;                   // largest scale
     int next, bad, rests;
@@ -86,13 +84,6 @@ struct BlockMemory {  // static shared memory of a thread block: data that is th
 #endif
 };
 __shared__ BlockMemory memory;
-#ifdef SECTIONS
-__device__ unsigned long long sections[32];
-__shared__ long long section_sums[32], section_mark;
-#define SECTION(k) if (threadIdx.x == 0) { const long long now = clock64(); section_sums[k] += now - section_mark; section_mark = now; }
-#else
-#define SECTION(k)
-#endif
 
 __device__ __forceinline__ bool usable(double a) { return a > 0 && a < 1e300; }
 
@@ -220,12 +211,8 @@ struct PcgSolver {
         return z;
     }
 
-    static __device__ __forceinline__ FlagWord<float>* residuals([[maybe_unused]] int half) {
-#ifdef LEAN_WORDS
-        return memory.inverse.residual;
-#else
+    static __device__ __forceinline__ FlagWord<float>* residuals(int half) {
         return memory.inverse.residual + (long long)half * (memory.inverse.size + 32);
-#endif
     }
 
     // 1. r = b - A x for the x of the scene, as a pending update by alpha = 1: x = 0 + 1 x, r = b - 1 (A x). With alpha = 0 the
@@ -267,11 +254,9 @@ struct PcgSolver {
             pass.last[begin + k] = given ? (real)rk : -qk;
             if (given && first_of_solve) pass.first[begin + k] = (real)rk;
 #endif
-#ifndef LEAN_WORDS
             if (!packed) return;
             publish(turn, k, bk);
             publish(1 - turn, k, (real)rk);  // not b - A x from float words, which near the solution would be rounding errors
-#endif
         });
         r_number = group.number;
         into_three<2>(mine);
@@ -427,7 +412,6 @@ struct PcgSolver {
         const BlockRows HELD rows = memory.rows;
         if (packed) rows.form(memory.inverse.z, z_number, beta, [&](int k, float z) { return applied(rows, k, z); });
         else rows.form(s.z, z_number, beta, [](int, real z) { return z; });
-        SECTION(4)
 #ifdef ERRORS
         double z2 = largest2([&](int k) { return rows.q[k]; });
         __syncthreads();
@@ -436,15 +420,9 @@ struct PcgSolver {
         rows.multiply([&](int node, int c, real q) {
             const int k = 3 * node + c;
             rows.keep_product(k, q, mine);
-#ifndef LEAN_WORDS
             if (packed) publish_product(k, q);
-#endif
         });
         q_number = group.number;
-        SECTION(5)
-#ifdef PREFETCHED
-        if (packed) memory.inverse.prefetch();
-#endif
         into_three<4>(mine);
 #ifdef ERRORS
         group.sums<4, 3, true>(mine, out, false, &z2);
@@ -454,55 +432,9 @@ struct PcgSolver {
 #endif
     }
 
-#ifdef LEAN_WORDS
-    // x += alpha p, r -= alpha q. The loads of a few entries travel together, as stores are behind all of them, where there are registers.
-    __device__ __forceinline__ void update(real alpha) const {
-        const BlockRows HELD rows = memory.rows;
-#ifndef MANY_ENTRIES
-#define MANY_ENTRIES (WARPS > 8 ? 1 : 3)
-#endif
-        const int count = 3 * rows.own;
-        for (int first = threadIdx.x; first < count; first += MANY_ENTRIES * THREADS) {
-            real r[MANY_ENTRIES], x[MANY_ENTRIES], p[MANY_ENTRIES], q[MANY_ENTRIES];
-            float d[MANY_ENTRIES];
-            int at[MANY_ENTRIES];
-#pragma unroll
-            for (int n = 0; n < MANY_ENTRIES; ++n) {
-                const int k = min(first + n * THREADS, count - 1);
-                r[n] = rows.r[k];
-                if (alpha != 0) { x[n] = rows.x[k]; p[n] = rows.values[k]; q[n] = rows.q[k]; }
-                if (packed) { d[n] = (float)scale_of(k); at[n] = rows.position(k / 3) + k % 3; }
-            }
-#pragma unroll
-            for (int n = 0; n < MANY_ENTRIES; ++n) {
-                const int k = first + n * THREADS;
-                if (k >= count) break;
-                if (alpha != 0) {
-                    r[n] -= alpha * q[n];
-                    rows.r[k] = r[n];
-                    rows.x[k] = x[n] + alpha * p[n];
-                }
-                if (packed) residuals(0)[at[n]].put((float)(d[n] * r[n]), group.number);
-            }
-        }
-    }
-#endif
-
     // 3. 4. 5. 6. x += alpha p, r -= alpha q, z = P^-1 r; returns z . r. r2: |r|^2 after the update.
     __device__ __forceinline__ double precondition(int kind, real alpha, double r2) {
-        [[maybe_unused]] const BlockRows HELD rows = memory.rows;
-        SECTION(11)
-#ifdef LEAN_WORDS
-#ifdef CORRECTED
-        if (column >= 0) {
-            for (int k = threadIdx.x; k < 3 * rows.own; k += THREADS) {
-                const CorrectionMemory& m = memory.correction;
-                publish(0, k, 3 * (m.node[column / 3] - rows.begin) + column % 3 == k);
-            }
-        } else
-#endif
-            update(alpha);
-#else
+        const BlockRows HELD rows = memory.rows;
         for (int k = threadIdx.x; k < 3 * rows.own; k += THREADS) {
 #ifdef CORRECTED
             if (column >= 0) {
@@ -520,7 +452,6 @@ struct PcgSolver {
             }
             if (packed) publish(1 - turn, k, r);
         }
-#endif
 #ifdef BUDGETS
         double mine[2], zr[2];
 #else
@@ -546,7 +477,6 @@ struct PcgSolver {
 #else
         group.sums<1, 1>(mine, zr);
 #endif
-        SECTION(10)
 #ifdef HELPED
         if (kind == CHOLESKY && memory.inverse.far) zr[0] += memory.help.sum(group);
 #endif
@@ -574,11 +504,7 @@ struct PcgSolver {
     }
 
     __device__ __forceinline__ double by_inverse(real alpha, double r2) {
-#ifdef FEW_REGISTERS
-        const PartitionedInverse HELD inverse = memory.inverse;
-#else
         const PartitionedInverse inverse = memory.inverse;
-#endif
         // a power of two that scales d r below 1, for the small range of float16
         const float unit = unit_for(r2 * memory.peak * memory.peak);
         ResidualSource from = {residuals(turn), r_number, q_number, fresh ? 0 : (float)alpha};  // the update is being applied
@@ -589,10 +515,7 @@ struct PcgSolver {
 #else
         fresh = false;
 #endif
-#ifdef LEAN_WORDS
-        from = {residuals(0), group.number, 0, 0};
-        __syncthreads();  // it is published just before
-#elif defined(ALONE) && defined(CORRECTED)
+#if defined(ALONE) && defined(CORRECTED)
         __syncthreads();  // a column is published just before
 #endif
         if (!fetched) fetch();
@@ -603,7 +526,6 @@ struct PcgSolver {
         inverse.open(stream);
 #endif
         arrived = true;
-        SECTION(7)
 #ifdef HELPED
         if (inverse.far && group.index == 0)
             memory.help.apply(memory.body.helper, from.r == residuals(1), from.r_number, from.q_number, from.alpha, 1 - turn, group.number, unit);
@@ -611,17 +533,15 @@ struct PcgSolver {
         for (int phase = 0; phase < inverse.phases; ++phase) {
             inverse.gather(phase, from, group.number, unit);
             __syncthreads();
-            SECTION(8)
 #ifdef ALONE
             mine += inverse.multiply(phase, from, group.number, unit, stream);
 #else
             mine += inverse.multiply(phase, from, group.number, unit);
 #endif
             from = {residuals(1 - turn), group.number, 0, 0};
-#if defined(ALONE)
-            if (phase + 1 < inverse.phases) __syncthreads();  // the vector has been read
+#ifdef ALONE
+            if (phase + 1 < inverse.phases) __syncthreads();  // the vector has been read, and words are in order
 #endif
-            SECTION(16 + phase)
         }
 #ifdef CORRECTED
         if (column >= 0) return mine;
@@ -853,9 +773,7 @@ __device__ __forceinline__ void PcgSolver::solve() {
 #ifdef ERRORS
             const double found = r2;
 #endif
-            SECTION(11)
             r2 = residual(bb, !begun);
-            SECTION(3)
             measure = false;
             alpha = 1;
             restart = true;
@@ -993,7 +911,6 @@ __device__ __forceinline__ void PcgSolver::solve() {
 #else
                 direction(restart ? 0 : (real)(zr * inverse_of(memory.rz)), sums);
 #endif
-                SECTION(6)
                 memory.rz = zr;
                 restart = false;
                 out.iterations = ++iterations;
@@ -1009,9 +926,7 @@ __device__ __forceinline__ void PcgSolver::solve() {
                 }
             }
         }
-        SECTION(11)
         give(1, (real)alpha);
-        SECTION(13)
         measure = true;
     }
 }
@@ -1019,7 +934,7 @@ __device__ __forceinline__ void PcgSolver::solve() {
 #ifdef STAGES  // an attempt of a Rosenbrock-W step (stages.cuh): solve only the bodies that make it
 #define KIND_OF_STEP , const StageSolve stage
 #define STAGE , stage
-#elif defined(NEWTON_PHASES)
+#elif defined(NEWTON_PHASES)  // several linearizations a step: solve only the bodies in phase 0 (newton.cu)
 #ifdef JUDGES
 #define KIND_OF_STEP , const int* __restrict__ active, const int* __restrict__ phase, Search* search
 #define STAGE , search
@@ -1027,7 +942,7 @@ __device__ __forceinline__ void PcgSolver::solve() {
 #define KIND_OF_STEP , const int* __restrict__ active, const int* __restrict__ phase
 #define STAGE
 #endif
-#elif defined(CONTACT_PASSES)
+#elif defined(CONTACT_PASSES)  // contact: in the first solve of a step all bodies, then those that are READY (contact_state.cuh)
 #define KIND_OF_STEP , const ContactSolve pass
 #define STAGE , pass
 #else
@@ -1156,16 +1071,8 @@ __device__ __forceinline__ void solve_body(const PcgArguments& s, const RowRange
 #ifdef CORRECTED
     solver.body = k;
 #endif
-#ifdef SECTIONS
-    if (threadIdx.x == 0) { for (int i = 0; i < 32; ++i) section_sums[i] = 0; section_mark = clock64(); }
-#endif
     solver.set_up(range);
-    SECTION(2)
     solver.solve();
-    SECTION(12)
-#ifdef SECTIONS
-    if (threadIdx.x == 0) { section_sums[0] = memory.out.iterations; section_sums[1] = 1; for (int i = 0; i < 32; ++i) atomicAdd(sections + i, (unsigned long long)section_sums[i]); }
-#endif
 #ifdef CORRECTED
     if (range.index == 0) solver.keep_correction();
 #endif

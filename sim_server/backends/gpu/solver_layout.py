@@ -101,7 +101,6 @@ class SolverLayout:
         assigned, most = best_assignment(nodes, processors, per_processor)
         grid = most if assigned.pooled else int(assigned.blocks.sum())
         declared = DECLARED_CORRECTED if features.correction else DECLARED
-        declared += 1024 if threads > 256 else 0  # of its warps
         partition = halo(spans, assigned.blocks, pattern[0], pattern[1][: pattern[0][-1]])
         made = cls(
             spans, threads, per_processor, grid, spared=processors - -(-grid // per_processor),

@@ -25,25 +25,14 @@
 // A is symmetric to the bit, so that the blocks on and above its diagonal are enough: they are kept in shared memory, all of them or
 // those of a window of rows that moves down. Each block of A has a word: 65536 times the rank of the block that is kept, among
 // those of the body; whether it is transposed; its column.
-#ifndef WARP_ROWS
-#define WARP_ROWS (WARPS > 8 ? 4 : 8)  // rows that a warp multiplies at a time
-#endif
-#define ROW_LANES (32 / WARP_ROWS)   // lanes that share a row: 4 or 8
+#define WARP_ROWS 8                  // rows that a warp multiplies at a time, each by four lanes
 #define WINDOW_ROWS (WARP_ROWS * WARPS)  // of a slab of the window
 #define WINDOW_BLOCKS (17 * WINDOW_ROWS) // most blocks of A in it
-#ifndef AHEAD
 #define AHEAD 1                      // slabs on their way while one is multiplied
-#endif
 #define COLUMN 0x7fff
 #define TRANSPOSED 0x8000
 #else
 #define COLUMN -1
-#endif
-
-#ifdef LEAN_WORDS
-using Scale = float;
-#else
-using Scale = real;
 #endif
 
 struct BlockRows {
@@ -55,7 +44,7 @@ struct BlockRows {
 #ifdef ERRORS
     real* before;          // (own, 3) x at the last look (iterate_error.cuh)
 #endif
-    Scale* scale;          // (own, 3) of the inverse, or null
+    real* scale;           // (own, 3) of the inverse, or null
     const int* row_start;  // (own + 1,), less `base`
     const int* columns;    // indices into the halo
     const real* blocks;
@@ -103,7 +92,7 @@ struct BlockRows {
         if (!bring_upper(s, (int)row, range, arena, others))
 #endif
             bring(s, (int)row, range, arena, others);
-        scale = inverted ? arena.take<Scale>(3 * own) : nullptr;
+        scale = inverted ? arena.take<real>(3 * own) : nullptr;
         r = taken(arena, s.own_vectors + 3 * row + all);
         q = taken(arena, s.own_vectors + 3 * row + 2 * all);
 #ifdef ALONE  // of all vectors it is used least
@@ -256,21 +245,14 @@ struct BlockRows {
         return place < ring ? place : place - ring;
     }
 
-#ifndef COPIED_BY
-#ifdef HALF_WARPS
-#define COPIED_BY 16  // lanes that copy a row
-#else
-#define COPIED_BY 32
-#endif
-#endif
-    // Begins to copy the blocks of rows from the diagonal on, a row by each warp, or half of one.
+    // Begins to copy the blocks of rows from the diagonal on, a row by each warp.
     __device__ __forceinline__ void ask_rows(int low, int high, int first, int at) const {
-        const int lane = threadIdx.x % COPIED_BY;
+        const int lane = threadIdx.x % 32;
         real* window = (real*)(shared_memory + near_blocks);
-        for (int row = low + (int)threadIdx.x / COPIED_BY; row < high; row += THREADS / COPIED_BY) {
+        for (int row = low + (int)threadIdx.x / 32; row < high; row += WARPS) {
             const int rank = upper[row], count = 9 * (upper[row + 1] - rank), place = placed(rank, first, at), room = 9 * (ring - place);
             const real* from = blocks + 9ll * (row_start[row + 1] - base) - count;
-            for (int k = lane; k < count; k += COPIED_BY) copy_async(window + 9 * place + (k < room ? k : k - 9 * ring), from + k, sizeof(real));
+            for (int k = lane; k < count; k += 32) copy_async(window + 9 * place + (k < room ? k : k - 9 * ring), from + k, sizeof(real));
         }
     }
 
@@ -307,13 +289,13 @@ struct BlockRows {
         for (int k = 0; k < AHEAD; ++k) ask_upper(k, 0, 0);
     }
 
-    // Rows low, low + 1, ... of a warp: lane ROW_LANES n + h adds blocks h, h + ROW_LANES, ... of the n-th. c_at: offset of the words
-    // from the block on that is `origin`-th. first, at: of the window (placed).
+    // Rows low, low + 1, ... of a warp: lane 4 n + h adds every fourth block of the n-th, from the h-th on. c_at: offset of the words from
+    // the block on that is `origin`-th. first, at: of the window (placed).
     template <class Done>
     __device__ __forceinline__ void of_window(int low, int end, int origin, int c_at, int first, int at, Done done) const {
         const real *a_of = shared_at<real>(near_blocks), *v_of = shared_at<real>(near_values);
         const int* c_of = shared_at<int>(c_at);
-        const int lane = threadIdx.x % 32, h = lane % ROW_LANES, node = low + lane / ROW_LANES, size = ring;
+        const int lane = threadIdx.x % 32, h = lane % 4, node = low + lane / 4, size = ring;
         int k = 0, last = 0;
         if (node < end) {
             k = row_start[node] - origin + h;
@@ -321,7 +303,7 @@ struct BlockRows {
         }
         real sum[3] = {0, 0, 0};
 #pragma unroll 2
-        for (; k < last; k += ROW_LANES) {
+        for (; k < last; k += 4) {
             const unsigned word = c_of[k];
             const bool transposed = word & TRANSPOSED;
             int place = (int)(word >> 16) - first + at;
@@ -332,23 +314,12 @@ struct BlockRows {
             sum[1] += a[row] * v0 + a[4] * v1 + a[row + 2 * column] * v2;
             sum[2] += a[2 * row] * v0 + a[2 * row + column] * v1 + a[8] * v2;
         }
-#ifdef SPLIT_SUMS
-        // The half of the lanes with the larger h adds entry 2, of the others a half each entries 0 and 1.
-        const bool third = h & ROW_LANES / 2, second = h & ROW_LANES / 4;
-        const real one = __shfl_xor_sync(ALL, third ? sum[0] : sum[2], ROW_LANES / 2), two = __shfl_xor_sync(ALL, sum[1], ROW_LANES / 2);
-        const real keep = (third ? sum[2] : sum[0]) + one, other = third ? keep : sum[1] + two;
-        real mine = second ? other : keep;
-        mine += __shfl_xor_sync(ALL, second ? keep : other, ROW_LANES / 4);
 #pragma unroll
-        for (int by = ROW_LANES / 8; by > 0; by /= 2) mine += __shfl_xor_sync(ALL, mine, by);
-        if (node < end && h % (ROW_LANES / 4) == 0 && h < 3 * ROW_LANES / 4) done(node, h / (ROW_LANES / 4), mine);
-#else
-#pragma unroll
-        for (int r = 0; r < 3; ++r)
-#pragma unroll
-            for (int by = 1; by < ROW_LANES; by *= 2) sum[r] += __shfl_xor_sync(ALL, sum[r], by);
+        for (int r = 0; r < 3; ++r) {
+            sum[r] += __shfl_xor_sync(ALL, sum[r], 1);
+            sum[r] += __shfl_xor_sync(ALL, sum[r], 2);
+        }
         if (node < end && h < 3) done(node, h, h == 0 ? sum[0] : h == 1 ? sum[1] : sum[2]);
-#endif
     }
 #endif
 

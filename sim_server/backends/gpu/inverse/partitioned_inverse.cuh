@@ -3,11 +3,12 @@
 //
 // A product of 16 rows x 32 columns is two matrix instructions, of 8 rows each. The 16 bytes of a chunk that a lane loads are the left
 // factor of one as they are: their columns 0, 1 and 4, 5 its row, columns 2, 3 and 6, 7 its row eight further down. So of the right
-// factor, which is the vector, four columns are used: its halves for the former and for the latter. Entries of the vector are two numbers
-// of float16 (value = high + low / 2048), which keep 22 bits of it, nearly those of float32. A warp needs five instructions for 1024 bytes of
-// matrix, so memory is the limit.
+// factor, which is the vector, four columns are used: its halves for the former and for the latter, as two numbers of float16
+// (value = high + low / 2048), which keep 22 bits of it, nearly those of float32. A warp needs five instructions for 1024 bytes of
+// matrix, so memory is the limit. The warps of a thread block have equal shares of the chunks of a phase, wherever in a tile they begin
+// and end.
 //
-// The warps of a thread block have equal shares of the chunks of a phase, wherever in a tile they begin and end.
+// With -DALONE, where little is left between phases, warps have whole tiles, and products are of 16 rows: two columns are used.
 #pragma once
 #include "block_group.cuh"
 #ifdef HELPED
@@ -15,22 +16,14 @@
 #endif
 
 #define LOW 2048.0f
-#ifndef CHUNKS_AT_ONCE
-#ifdef ALONE
-#define CHUNKS_AT_ONCE (THREADS > 256 ? 2 : 4)
-#else
-#define CHUNKS_AT_ONCE 8
-#endif
-#endif
-#ifndef UNDER_WAY
-#define UNDER_WAY 3  // 2 or 3 groups of so many chunks, for each warp: -DALONE
-#endif
-constexpr int PADDING = 32;    // entries behind vectors, to which padding refers
+constexpr int PADDING = 32;  // entries behind vectors, to which padding refers
 #define LISTS 32768   // most bytes of a list that is copied to shared memory
 #ifdef ALONE          // words are at hand: few registers matter more
+#define CHUNKS_AT_ONCE 4
 #define FEW 2         // segments that a warp loads at a time, for short lists
 #define MANY 4
 #else
+#define CHUNKS_AT_ONCE 6
 #define FEW 3
 #define MANY 8        // 2304 entries in one trip through L2 with 8 warps
 #endif
@@ -73,7 +66,11 @@ __device__ __forceinline__ void put_halves(const SplitVector& to, int i, float v
 
 // Place of entry `lane` of a segment in the vector.
 __device__ __forceinline__ int entry_place(int lane) {
+#ifdef ALONE
+    return lane;
+#else
     return (lane & ~6) | (lane & 2) << 1 | (lane & 4) >> 1;  // of each eight: 0, 1, 4, 5, 2, 3, 6, 7
+#endif
 }
 
 __device__ __forceinline__ unsigned shared_address(const void* p) { return (unsigned)__cvta_generic_to_shared(p); }
@@ -82,33 +79,6 @@ __device__ __forceinline__ uint4 shared_vector_load(unsigned from) {
     uint4 v;
     asm volatile("ld.shared.v4.u32 {%0, %1, %2, %3}, [%4];" : "=r"(v.x), "=r"(v.y), "=r"(v.z), "=r"(v.w) : "r"(from));
     return v;
-}
-
-#ifdef EVICT_FIRST  // chunks are the first to leave L2, so that A stays there from one product to the next
-#define PASSING ".L2::cache_hint"
-#define PASSING_POLICY ", %6"
-#else
-#define PASSING ""
-#define PASSING_POLICY ""
-#endif
-// Loads 16 bytes of a matrix, for which nothing else should leave L1, from the K-th chunk behind `from`.
-template <int K>
-__device__ __forceinline__ uint4 chunk_load(const uint4* from, [[maybe_unused]] unsigned long long policy) {
-    uint4 v;
-    asm volatile("ld.global.nc.L1::no_allocate" PASSING ".v4.u32 {%0, %1, %2, %3}, [%4+%5]" PASSING_POLICY ";"
-                 : "=r"(v.x), "=r"(v.y), "=r"(v.z), "=r"(v.w) : "l"(from), "n"(512 * K), "l"(policy));
-    return v;
-}
-__device__ __forceinline__ unsigned long long chunk_policy() {
-    unsigned long long policy = 0;
-#ifdef EVICT_FIRST
-    asm volatile("createpolicy.fractional.L2::evict_first.b64 %0, 1.0;" : "=l"(policy));
-#endif
-    return policy;
-}
-
-__device__ __forceinline__ void prefetch_chunks(const uint4* from, int bytes) {
-    asm volatile("cp.async.bulk.prefetch.L2.global [%0], %1;" ::"l"(from), "r"(bytes));
 }
 
 // Loads 8 bytes of shared memory if `wanted`, else zeros, without a branch.
@@ -121,7 +91,7 @@ __device__ __forceinline__ uint2 shared_pair_load(unsigned from, bool wanted) {
     return v;
 }
 
-// sum += a b: a of 16 rows x 16 columns, b of 16 x 8, of which four columns are used.
+// sum += a b: a of 16 rows x 16 columns, b of 16 x 8, of which two or four columns are used.
 __device__ __forceinline__ void multiply_add(float sum[4], unsigned a0, unsigned a1, unsigned a2, unsigned a3, unsigned b0, unsigned b1) {
 #if __CUDA_ARCH__ >= 800
     asm("mma.sync.aligned.m16n8k16.row.col.f32.f16.f16.f32 {%0, %1, %2, %3}, {%4, %5, %6, %7}, {%8, %9}, {%0, %1, %2, %3};"
@@ -199,7 +169,9 @@ struct PartitionedInverse {
         size = plan->size; phases = plan->phases; groups = plan->groups;
         vector.high = arena.take<unsigned short>(shared_plan->entries);
         vector.low = arena.take<unsigned short>(shared_plan->entries);
+#ifndef ALONE
         tile_sums = arena.take<float>(16 * 2 * WARPS);
+#endif
         const BlockRanges part = plan->block_ranges[index];
         lists = brought(plan->lists + index * (3 * phases + 2), 3 * phases + 2, arena);
         tiles = brought(plan->tiles + part.tile, part.tiles, arena);
@@ -218,12 +190,8 @@ struct PartitionedInverse {
         residual = body.residual; product = body.product; z = body.z;
         formed = body.formed; solved = body.solved; contributed = body.contributed;
 #ifdef ALONE
-#ifdef LEAN_WORDS
-        words(residual, size + PADDING, arena);
-#else
         words(residual, 2 * (size + PADDING), arena);
         words(product, size + PADDING, arena);
-#endif
         words(z, size + PADDING, arena);
         words(solved, size + PADDING, arena);
         words(contributed, plan->contributions, arena);
@@ -284,11 +252,7 @@ struct PartitionedInverse {
             for (int k = 0; k < N; ++k) {
                 const int i = segments[min(at + k * WARPS, last - 1)].from + lane;
                 r[k] = from.r[i].load();
-#ifdef LEAN_WORDS  // there is no update to be applied
-                q[k] = r[k];
-#else
                 q[k] = product[i].load();
-#endif
             }
             all = true;
 #pragma unroll
@@ -392,21 +356,158 @@ struct PartitionedInverse {
             if (at + k * WARPS < last) put_halves(vector, segments[at + k * WARPS].to + entry_place(lane), unit * v[k]);
     }
 
+#ifdef ALONE
+    // Chunks of a tile on their way to a warp: of its upper eight rows, and of its lower ones.
+    struct Group {
+        uint4 upper[CHUNKS_AT_ONCE], lower[CHUNKS_AT_ONCE];
+        int phase, x, count;  // of the tile; first entry of the vector; chunks
+        int rows, out;        // of a tile's last group: its rows, else 0; where this lane's row goes
+        float scale;          // likewise: its scale
+        bool last;            // of a plane
+    };
+
+    // The groups of a warp, one after another through all phases: three of them are on their way while one is multiplied, also from one
+    // phase to the next.
+    struct Stream {
+        Group group[3];
+        int turn, phase, job, plane, at;
+    };
+
+    __device__ __forceinline__ void open(Stream& s) const {
+        s.turn = s.phase = s.plane = s.at = 0;
+        s.job = threadIdx.x / 32;
+#pragma unroll
+        for (int n = 0; n < 3; ++n) {
+#pragma unroll
+            for (int k = 0; k < CHUNKS_AT_ONCE; ++k) s.group[n].upper[k] = s.group[n].lower[k] = make_uint4(0, 0, 0, 0);
+            ask(s, s.group[n]);
+        }
+    }
+
+    __device__ __forceinline__ void ask(Stream& s, Group& g) const {
+        while (s.phase < phases && s.job >= lists[phases + 2 + s.phase] - lists[phases + 1 + s.phase]) {
+            ++s.phase;
+            s.job = threadIdx.x / 32;
+        }
+        g.phase = s.phase;
+        if (s.phase == phases) return;
+        const Tile tile = tiles[lists[phases + 1 + s.phase] + s.job];
+        const int from = tile.chunk - begin + s.plane * tile.chunks + s.at, lane = threadIdx.x % 32;
+        g.count = min(CHUNKS_AT_ONCE, tile.chunks - s.at);
+        g.x = tile.x + 32 * s.at;
+        g.rows = 0;
+        const int second = tile.rows > 8 ? tile.chunks * planes : 0;  // rows that a tile has not are not used
+        if (from + second + g.count <= near) {
+            const unsigned a = shared_address(kept + lane) + 512 * from, b = a + 512 * second;
+#pragma unroll
+            for (int k = 0; k < CHUNKS_AT_ONCE; ++k)
+                if (k < g.count) {
+                    g.upper[k] = shared_vector_load(a + 512 * k);
+                    g.lower[k] = shared_vector_load(b + 512 * k);
+                }
+        } else {
+            const uint4 *a = matrix + 32ll * from + lane, *b = a + 32 * second;
+#pragma unroll
+            for (int k = 0; k < CHUNKS_AT_ONCE; ++k)
+                if (k < g.count) {
+                    g.upper[k] = __ldg(a + 32 * k);
+                    g.lower[k] = __ldg(b + 32 * k);
+                }
+        }
+        s.at += CHUNKS_AT_ONCE;
+        g.last = s.at >= tile.chunks;
+        if (!g.last) return;
+        s.at = 0;
+        if (++s.plane < planes) return;
+        g.rows = tile.rows;
+        g.out = tile.out + min(lane, tile.rows - 1);
+        if (s.phase < groups - 1) g.out = __ldg(plan->target + g.out);
+        else g.scale = __ldg(scale + g.out);
+        s.plane = 0;
+        s.job += WARPS;
+    }
+
+    // Products of a phase; returns this thread's part of z . r.
+    __device__ __forceinline__ double multiply(int phase, const ResidualSource& from, unsigned number, float unit, Stream& s) const {
+        const int lane = threadIdx.x % 32;
+        const bool forward = phase < groups - 1;
+        const float back = 1 / unit;
+        float sum[2][4] = {}, total = 0, weight = 1;
+        double zr = 0;
+        auto take = [&](Group& g) {
+            const unsigned half = shared_address((lane & 4 ? vector.low : vector.high) + g.x + 8 * (lane % 4));
+            uint4 v[CHUNKS_AT_ONCE];  // of its eight columns two are used: what the other lanes load does not matter
+#pragma unroll
+            for (int k = 0; k < CHUNKS_AT_ONCE; ++k) v[k] = shared_vector_load(half + 64 * min(k, g.count - 1));
+#pragma unroll
+            for (int k = 0; k < CHUNKS_AT_ONCE; ++k)
+                if (k < g.count) {
+                    const uint4 m = g.upper[k], n = g.lower[k];
+                    multiply_add(sum[0], m.x, n.x, m.y, n.y, v[k].x, v[k].y);
+                    multiply_add(sum[1], m.z, n.z, m.w, n.w, v[k].z, v[k].w);
+                }
+            const bool last = g.last;
+            const int rows = g.rows, i = g.out;
+            const float d = g.scale;
+            ask(s, g);
+            if (!last) return;
+            const float above = sum[0][0] + sum[1][0] + (sum[0][1] + sum[1][1]) / LOW;  // lane 4 r: row r
+            const float below = sum[0][2] + sum[1][2] + (sum[0][3] + sum[1][3]) / LOW;  // and row r + 8
+            const float one = __shfl_sync(ALL, above, 4 * (lane % 8)), two = __shfl_sync(ALL, below, 4 * (lane % 8));
+            total += weight * (lane & 8 ? two : one);
+            weight /= LOW;
+            for (int k = 0; k < 4; ++k) sum[0][k] = sum[1][k] = 0;
+            if (rows == 0) return;
+            const float value = back * total;
+            total = 0;
+            weight = 1;
+            if (lane >= rows) return;
+            if (forward) {
+                contributed[i].put(value, number);
+                return;
+            }
+            solved[i].put(value, number);
+            z[i].put(d * value, number);
+            if (d == 0) return;  // padding
+            float ri, qi = 0;
+            from.r[i].get(ri, from.r_number);
+            if (from.alpha != 0) product[i].get(qi, from.q_number);
+            zr += (double)value * (ri - from.alpha * qi);
+        };
+        for (;;) {
+            if (s.turn == 0) {
+                if (s.group[0].phase != phase) break;
+                take(s.group[0]);
+                __syncwarp();
+                s.turn = 1;
+            }
+            if (s.turn == 1) {
+                if (s.group[1].phase != phase) break;
+                take(s.group[1]);
+                __syncwarp();
+                s.turn = 2;
+            }
+            if (s.group[2].phase != phase) break;
+            take(s.group[2]);
+            __syncwarp();
+            s.turn = 0;
+        }
+        return zr;
+    }
+#else
     // Address of what this lane has of the vector's first 32 entries from x on.
     __device__ __forceinline__ unsigned vector_address(int x) const {
         const int lane = threadIdx.x % 32;
-        const unsigned short* half = (lane & 4 ? vector.low : vector.high) + x + 8 * (lane % 4);
-        half += lane & 8 ? 4 : 0;
-        return shared_address(half);
+        return shared_address((lane & 4 ? vector.low : vector.high) + x + 8 * (lane % 4) + (lane & 8 ? 4 : 0));
     }
 
     // Row `lane` (of sixteen) of what a warp has summed up, in lanes 0 to 15.
     static __device__ __forceinline__ float row_of(const float sum[2][4]) {
-        const int lane = threadIdx.x % 32;
-        const float* own = sum[0];
-        float a = own[0], b = own[1], c = own[2], d = own[3];
-        if (lane & 2) { a = sum[1][0]; b = sum[1][1]; c = sum[1][2]; d = sum[1][3]; }
-        float part = lane & 1 ? c + d / LOW : a + b / LOW;
+        const int lane = threadIdx.x % 32;  // lanes 4 r, 4 r + 1 have halves of row r, the two behind them of row r + 8
+        const bool lower = lane & 2;
+        const float first = (lower ? sum[1][0] : sum[0][0]) + (lower ? sum[1][1] : sum[0][1]) / LOW;
+        const float second = (lower ? sum[1][2] : sum[0][2]) + (lower ? sum[1][3] : sum[0][3]) / LOW;
+        float part = lane & 1 ? second : first;
         part += __shfl_xor_sync(ALL, part, 1);
         return __shfl_sync(ALL, part, 4 * (lane % 8) + (lane & 8 ? 2 : 0));
     }
@@ -434,204 +535,6 @@ struct PartitionedInverse {
         return value;
     }
 
-#ifdef ALONE
-    // Chunks of a piece of a tile on their way to a warp: of its upper eight rows, and of its lower ones.
-    struct Group {
-        uint4 upper[CHUNKS_AT_ONCE], lower[CHUNKS_AT_ONCE];
-        unsigned vector;      // address of what this lane multiplies them by
-        int phase, count;     // count: of chunks
-        int piece;            // of the last group of a piece: rows, 64 if another warp has begun the tile, 128 end if one ends it; else 0
-        int out;              // where this lane's row goes
-        float scale;          // and its scale
-        bool last;            // of a plane
-    };
-
-    // The groups of a warp, one after another through all phases: others are on their way while one is multiplied, also from one phase to
-    // the next.
-    struct Stream {
-        Group group[UNDER_WAY];
-        int turn, phase, tile, next, high;  // high: end of the share in the phase, of which chunks before `next` are in pieces
-        int left, plane, length;            // chunks of the piece that are to be asked for; of a plane
-        int at, below;                      // next chunk of the storage; from a chunk to that of the lower rows
-        unsigned vector;
-        bool kept;                          // the tile is in shared memory
-        unsigned long long policy;
-    };
-
-#ifdef PREFETCHED
-    // Begins to bring the first chunks that each warp will need into L2, PREFETCHED bytes of them.
-    __device__ __forceinline__ void prefetch() const {
-        const int warp = threadIdx.x / 32, first = lists[phases + 1], count = lists[phases + 2] - first, total = chunks_of(first, count);
-        const int low = share(warp, total);
-        const Tile tile = tiles[tile_at(first, count, low)];
-        const int at = tile.chunk - begin + low - tile.before, last = plan->block_ranges[0].chunks;
-        if (at < near || threadIdx.x % 32) return;
-        const int bytes = min(PREFETCHED, 512 * (last - at));
-        prefetch_chunks(matrix + 32ll * at, bytes);
-    }
-#endif
-
-    __device__ __forceinline__ void open(Stream& s) const {
-        s.turn = s.next = s.high = s.left = s.plane = 0;
-        s.phase = -1;
-        s.policy = chunk_policy();
-#pragma unroll
-        for (int n = 0; n < UNDER_WAY; ++n) {
-#pragma unroll
-            for (int k = 0; k < CHUNKS_AT_ONCE; ++k) s.group[n].upper[k] = s.group[n].lower[k] = make_uint4(0, 0, 0, 0);
-            ask(s, s.group[n]);
-        }
-    }
-
-    // Goes on to the next piece of this warp. Returns false after the last one.
-    __device__ __forceinline__ bool next_piece(Stream& s) const {
-        while (s.next == s.high) {
-            if (s.phase + 1 >= phases) { s.phase = phases; return false; }
-            ++s.phase;
-            const int warp = threadIdx.x / 32, first = lists[phases + 1 + s.phase], count = lists[phases + 2 + s.phase] - first;
-            const int total = chunks_of(first, count);
-            s.next = share(warp, total);
-            s.high = share(warp + 1, total);
-            s.tile = tile_at(first, count, s.next) - 1;
-        }
-        const Tile tile = tiles[++s.tile];
-        const int from = s.next - tile.before, to = min(tile.chunks, s.high - tile.before);
-        s.length = s.left = to - from;
-        s.next += s.length;
-        s.plane = 0;
-        s.at = tile.chunk - begin + from;
-        s.below = tile.rows > 8 ? tile.chunks * planes : 0;  // rows that a tile has not are not used
-        s.kept = s.at - from + s.below + tile.chunks * planes <= near;
-        s.vector = vector_address(tile.x + 32 * from);
-        return true;
-    }
-
-    template <int K>
-    static __device__ __forceinline__ void far_chunks(Group& g, const uint4* upper, const uint4* lower, unsigned long long policy) {
-        if constexpr (K < CHUNKS_AT_ONCE) {
-            if (K >= g.count) return;
-            g.upper[K] = chunk_load<K>(upper, policy);
-            g.lower[K] = chunk_load<K>(lower, policy);
-            far_chunks<K + 1>(g, upper, lower, policy);
-        }
-    }
-
-    __device__ __forceinline__ void ask(Stream& s, Group& g) const {
-        if (s.left == 0 && !next_piece(s)) {
-            g.phase = phases;
-            return;
-        }
-        const int lane = threadIdx.x % 32;
-        g.phase = s.phase;
-        g.count = min(CHUNKS_AT_ONCE, s.left);
-        g.vector = s.vector;
-        if (s.kept) {
-            const unsigned a = shared_address(kept + lane) + 512 * s.at, b = a + 512 * s.below;
-#pragma unroll
-            for (int k = 0; k < CHUNKS_AT_ONCE; ++k)
-                if (k < g.count) {
-                    g.upper[k] = shared_vector_load(a + 512 * k);
-                    g.lower[k] = shared_vector_load(b + 512 * k);
-                }
-        } else {
-            const uint4 *a = matrix + (32 * s.at + lane), *b = a + 32 * s.below;
-            far_chunks<0>(g, a, b, s.policy);
-        }
-        s.at += g.count;
-        s.vector += 64 * g.count;
-        s.left -= g.count;
-        g.piece = 0;
-        g.last = s.left == 0;
-        if (!g.last) return;
-        const Tile tile = tiles[s.tile];
-        if (++s.plane < planes) {
-            s.at += tile.chunks - s.length;
-            s.vector -= 64 * s.length;
-            s.left = s.length;
-            return;
-        }
-        const int end = tile.before + tile.chunks;
-        g.piece = tile.rows | (s.next - s.length > tile.before ? 64 : s.next < end ? 128 * end : 0);
-        g.out = tile.out + min(lane, tile.rows - 1);
-        if (s.phase < groups - 1) g.out = __ldg(plan->target + g.out);
-        else g.scale = __ldg(scale + g.out);
-    }
-
-    // Products of a phase; returns this thread's part of z . r.
-    __device__ __forceinline__ double multiply(int phase, const ResidualSource& from, unsigned number, float unit, Stream& s) const {
-        const int lane = threadIdx.x % 32, warp = threadIdx.x / 32;
-        const bool forward = phase < groups - 1;
-        const float back = 1 / unit;
-        float sum[2][4] = {}, total = 0, weight = 1, d_open = 0;
-        int open_piece = 0, open_out = 0;  // of a tile that this warp begins and others end
-        double zr = 0;
-        auto finish = [&](float value, int i, float d) {
-            if (forward) {
-                contributed[i].put(value, number);
-                return;
-            }
-            solved[i].put(value, number);
-            z[i].put(d * value, number);
-            if (d == 0) return;  // padding
-            float ri, qi = 0;
-            from.r[i].get(ri, from.r_number);
-            if (from.alpha != 0) product[i].get(qi, from.q_number);
-            zr += (double)value * (ri - from.alpha * qi);
-        };
-        auto take = [&](Group& g) {
-            uint2 v[CHUNKS_AT_ONCE];  // zero behind the last chunk, where a chunk of an earlier group is left
-#pragma unroll
-            for (int k = 0; k < CHUNKS_AT_ONCE; ++k) v[k] = shared_pair_load(g.vector + 64 * k, k < g.count);
-#pragma unroll
-            for (int k = 0; k < CHUNKS_AT_ONCE; ++k) {
-                const uint4 m = g.upper[k], n = g.lower[k];
-                multiply_add(sum[0], m.x, m.y, m.z, m.w, v[k].x, v[k].y);
-                multiply_add(sum[1], n.x, n.y, n.z, n.w, v[k].x, v[k].y);
-            }
-            const bool last = g.last;
-            const int piece = g.piece, i = g.out;
-            const float d = g.scale;
-            ask(s, g);
-            if (!last) return;
-            total += weight * row_of(sum);
-            weight /= LOW;
-            for (int k = 0; k < 4; ++k) sum[0][k] = sum[1][k] = 0;
-            if (piece == 0) return;
-            const float value = back * total;
-            total = 0;
-            weight = 1;
-            if (piece >= 128) { open_piece = piece; open_out = i; d_open = d; }
-            if (lane >= (piece & 63)) return;
-            if (piece < 64) finish(value, i, d);
-            else tile_sums[16 * (2 * warp + (piece >= 128)) + lane] = value;
-        };
-        for (;;) {
-            if (s.turn == 0) {
-                if (s.group[0].phase != phase) break;
-                take(s.group[0]);
-                __syncwarp();
-                s.turn = 1;
-            }
-            if (s.turn == 1) {
-                if (s.group[1].phase != phase) break;
-                take(s.group[1]);
-                __syncwarp();
-                s.turn = UNDER_WAY > 2 ? 2 : 0;
-            }
-            if constexpr (UNDER_WAY > 2) {
-                if (s.group[2].phase != phase) break;
-                take(s.group[2]);
-                __syncwarp();
-                s.turn = 0;
-            }
-        }
-        __syncthreads();
-        const int first = lists[phases + 1 + phase];
-        if (lane < (open_piece & 63))
-            finish(joined(warp, chunks_of(first, lists[phases + 2 + phase] - first), open_piece / 128), open_out, d_open);
-        return zr;
-    }
-#else
     // Sums over chunks [from, to) of this block's storage, and over those `second` further on, of the next eight rows; the
     // vector begins at `x`.
     template <bool NEAR>
@@ -672,7 +575,8 @@ struct PartitionedInverse {
         return total;
     }
 
-    // Computes the products of a phase; returns this thread's part of z . r. unit: factor by which the vector is scaled.
+    // Computes the products of a phase; returns this thread's part of z . r. The vector has been read by all threads. unit: factor by
+    // which it is scaled.
     __device__ __forceinline__ double multiply(int phase, const ResidualSource& from, unsigned number, float unit) const {
         const int lane = threadIdx.x % 32, warp = threadIdx.x / 32;
         const int first = lists[phases + 1 + phase], count = lists[phases + 2 + phase] - first;
@@ -726,7 +630,7 @@ struct PartitionedInverse {
             else tile_sums[16 * (2 * warp + opens) + lane] = value;
             if (opens && !whole) open = end;
         }
-        __syncthreads();  // now the vector has been read, too
+        __syncthreads();  // the vector has been read, too
         if (open > 0) finish(back * joined(warp, total, open));
         return zr;
     }
