@@ -1,12 +1,14 @@
 # SPDX-License-Identifier: MIT
 """Refuses scenes that are larger than the server is allowed to hold, before anything of theirs is allocated.
 
-The bytes are an estimate for the CPU: a line in the elements, and for solves with factors the copies of L that a server
-holds at a time. On a GPU the host's part of these is less, and the page-locked copies of matrices come to it, without
-those of spare nodes of splits. L of a body of n nodes is taken for 72 n^(4/3) values: the law of nested dissection in
-3D (George, Nested dissection of a regular finite element mesh, 1973), with the constant of bars of 1,500 to 1,029,000
-tets by METIS, where it is 39 to 76. The rest is fitted to the largest resident memory of servers with 1,500 to 202,272
-tets, linear corotational, with a worker and a log (tests/scene/test_size_limits.py).
+The bytes are an estimate for the CPU: a line in the elements and spare nodes, and for solves with factors the copies of
+L that a server holds at a time. On a GPU the host's part of these is less, and the page-locked copies of matrices come
+to it. L of a body of n nodes is taken for 72 n^(4/3) values: the law of nested dissection in 3D (George, Nested
+dissection of a regular finite element mesh, 1973), with the constant of bars of 1,500 to 1,029,000 tets by METIS, where
+it is 39 to 76. Nodes of smoothed and patch elements have neighbours two elements away, so that separators are thicker:
+the constant is larger, and the smaller the body the more of a separator lies at its surface. The rest is fitted to the
+largest resident memory of servers with 1,500 to 202,272 tets, corotational, with a worker and a log
+(tests/scene/test_size_limits.py).
 """
 
 import math
@@ -24,20 +26,26 @@ from sim_server.scene.sizes import SIZES, measure
 Copies = Callable[[Sequence[float]], float]
 
 BASE = 126e6  # bytes of the process
-TET = 2e3  # bytes of an element: arrays of mesh, matrix, kernels and frames
+# Bytes of an element: arrays of mesh, matrix, kernels and frames; by kind of element. Of quadratic ones: of their parts
+TET = {"linear": 2e3, "patch": 3.5e3, "smoothed": 5.8e3, "quadratic": 2e3}
+SPARE = 5e3  # bytes of a node that is kept for splits: the same, and room for blocks of A
 VALUES = 72.0  # numbers of L over nodes^(4/3)
+THICK = {"patch": (145.0, 700.0), "smoothed": (270.0, 1740.0)}  # the same; numbers less for each node
 HELD = 3  # copies of L in memory of the server's own: in use, the next one, and one that arrives
 LENT = 3  # the same in slots of shared memory, as far as these may be lent
 BLOCKS = {"linear": 15, "patch": 31, "smoothed": 46, "quadratic": 29}  # of A over nodes of a bar, by kind of element
 TETS_OF_A_CELL, TETS_OF_A_TET = 6, 8  # of a bar; of a quadratic element, which is split
+EDGES = 6  # of an element
 
 
 class Size(NamedTuple):
     """Of an object, as it is simulated."""
 
     tets: int
-    nodes: int
+    nodes: int  # but for spare ones
     blocks: int = 0  # of A
+    kind: str = "linear"  # of its elements
+    spares: int = 0
 
 
 @dataclass(frozen=True)
@@ -86,13 +94,19 @@ def estimate(sizes: Sequence[Size], factors: bool, copies: Copies | None = None)
     factors: solves use them
     copies: returns the bytes of memory for copies of matrices with so many blocks; None: who needs one makes it
     """
-    needed = BASE + TET * sum(size.tets for size in sizes)
+    needed = BASE + sum(TET[size.kind] * size.tets + SPARE * size.spares for size in sizes)
     if not factors:
         return needed
-    each = [4 * VALUES * size.nodes ** (4 / 3) for size in sizes]
+    each = [4 * values(size) for size in sizes]
     lent = sum(size for size in each if size <= POOL_LIMIT / SLOT_SHARE)  # larger ones travel in parts
     copied = 0.0 if copies is None else copies([size.blocks for size in sizes])
     return needed + HELD * sum(each) + min(LENT * lent, POOL_LIMIT) + copied
+
+
+def values(size: Size) -> float:
+    """Returns how many values L of a body about has, at most."""
+    most, less = THICK.get(size.kind, (VALUES, 0.0))
+    return max(most * size.nodes ** (4 / 3) - less * size.nodes, 4.5 * size.blocks)  # as many as half of A at least
 
 
 def expected_values(nodes: int, blocks: int) -> float:
@@ -102,12 +116,16 @@ def expected_values(nodes: int, blocks: int) -> float:
 
 
 def _size(o: SceneObject, integrator: IntegratorOptions) -> Size:
-    bar = o.mesh.bar
+    bar, mesh = o.mesh.bar, None
     if bar is None:
         mesh = o.load_mesh()
-        return Size(len(mesh.tets), len(mesh.rest), BLOCKS[kind_of_elements(o, mesh, integrator)] * len(mesh.rest))
-    quadratic = o.elements == "quadratic"
-    cells = [2 * cells for cells in bar] if quadratic else bar
-    tets = TETS_OF_A_CELL * math.prod(bar) * (TETS_OF_A_TET if quadratic else 1)
-    nodes = math.prod(count + 1 for count in cells)
-    return Size(tets, nodes, BLOCKS[kind_of_elements(o, None, integrator)] * nodes)
+        tets, nodes = len(mesh.tets), len(mesh.rest)
+    else:
+        quadratic = o.elements == "quadratic"
+        cells = [2 * cells for cells in bar] if quadratic else bar
+        tets = TETS_OF_A_CELL * math.prod(bar) * (TETS_OF_A_TET if quadratic else 1)
+        nodes = math.prod(count + 1 for count in cells)
+    kind, spares = kind_of_elements(o, mesh, integrator), getattr(o.effects.get("cutting"), "spare", 0)
+    beside = BLOCKS[kind] - 1
+    room = spares + 2 * min(spares * beside, max(EDGES * tets - beside * nodes // 2, 0))  # split_pattern.py
+    return Size(tets, nodes, BLOCKS[kind] * nodes + room, kind, spares)

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from protocol.factor import Factor, FactorPattern
+from protocol.factors_together import FactorsTogether
 from protocol.method import Method
 from sim_server.arrays import Float64, Int32
 from sim_server.updates.patterns import Patterns
@@ -71,6 +72,10 @@ class FactorSource(Protocol):
     @abstractmethod
     def poll(self) -> list[Factor]:
         """Returns the factors that arrived since the last call."""
+
+    def poll_together(self) -> list[FactorsTogether]:
+        """Returns those of them that came in messages of several; the next `poll` returns the others."""
+        return []
 
     @abstractmethod
     def failures(self) -> list[tuple[str, str]]:

@@ -7,10 +7,11 @@ from pathlib import Path
 
 import pytest
 
+from precond_worker.factorization.factorize import Analysis
 from sim_server import backends
 from sim_server.errors import InputError
 from sim_server.scene import load
-from sim_server.scene.size_limits import Size, SizeLimits, estimate
+from sim_server.scene.size_limits import Size, SizeLimits, estimate, values
 from sim_server.simulation import Simulation
 
 ROOT = Path(__file__).parents[2]
@@ -77,6 +78,13 @@ MEASURED = [  # largest resident memory of servers with a log [bytes]: bars, sol
     ((28, 28, 43), "linear", True, 1701.3e6),
     ((5, 5, 10), "quadratic", True, 236.0e6),
     ((10, 10, 20), "quadratic", True, 1024.9e6),
+    ((10, 10, 20), "patch", True, 256.3e6),
+    ((16, 16, 26), "patch", True, 600.0e6),
+    ((10, 10, 20), "smoothed", True, 323.5e6),
+    ((16, 16, 26), "smoothed", True, 964.7e6),
+    ((16, 16, 26), "patch", False, 259.1e6),
+    ((10, 10, 20), "smoothed", False, 195.2e6),
+    ((16, 16, 26), "smoothed", False, 357.7e6),
     ((16, 16, 26), "linear", False, 185.3e6),
     ((28, 28, 43), "linear", False, 467.5e6),
 ]
@@ -95,6 +103,24 @@ def test_the_estimate_is_near_what_was_measured(
     SizeLimits(None, measured * 7 / 6).check(load(path))
     with pytest.raises(InputError, match="--max-memory allows"):
         SizeLimits(None, measured * 5 / 6).check(load(path))
+
+
+@pytest.mark.parametrize(("factors", "spares", "measured"), [(False, 2000, 164.4e6), (True, 20_000, 297.8e6)])
+def test_spare_nodes_are_counted(factors: bool, spares: int, measured: float) -> None:
+    """Of the bar of 12,000 tets, as above."""
+    size = Size(12_000, 2541)
+    assert estimate([size._replace(spares=spares)], factors) == pytest.approx(measured, rel=1 / 6)
+    assert estimate([size], factors) < estimate([size._replace(spares=spares)], factors)
+
+
+@pytest.mark.parametrize(("kind", "cells"), [("linear", 20), ("patch", 20), ("smoothed", 20), ("quadratic", 10)])
+def test_factors_have_about_as_many_values_as_is_told(kind: str, cells: int, tmp_path: Path) -> None:
+    """Real ones of bars of 2,541 nodes: never more; bars with many more nodes have up to 1.7 times as many for it."""
+    given = load(scene(tmp_path, [cells // 2, cells // 2, cells]), [CHOLESKY[1].format(kind)])
+    system = Simulation(given).system
+    nodes = len(system.row_start) - 1
+    found = Analysis(system.row_start, system.columns).pattern.nonzeros
+    assert found <= values(Size(0, nodes, len(system.columns), kind)) <= 1.75 * found
 
 
 def test_factors_of_large_bodies_are_not_counted_in_shared_memory() -> None:
@@ -122,6 +148,15 @@ def test_blocks_of_matrices_are_near_those_that_there_are(kind: str, tmp_path: P
         lambda counts: told.extend(counts) or 0.0,
     )
     assert len(told) == 1 and blocks <= told[0] <= 1.34 * blocks
+
+
+@pytest.mark.parametrize("spares", [20, 5000])
+def test_room_for_blocks_of_spare_nodes_is_counted(spares: int, tmp_path: Path) -> None:
+    path, told = scene(tmp_path, [6, 6, 8]), list[float]()
+    path.write_text(path.read_text() + f"cutting = {{ spare = {spares} }}\n")
+    room = len(Simulation(load(path)).system.columns)
+    SizeLimits(None, 1e12).check(load(path, CHOLESKY[:1]), lambda counts: told.extend(counts) or 0.0)
+    assert room <= told[0] <= 1.34 * room
 
 
 def test_copies_of_matrices_of_a_gpu_are_counted() -> None:

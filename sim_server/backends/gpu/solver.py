@@ -17,7 +17,7 @@ from sim_server.backends.compiler import SOURCES
 from sim_server.backends.gpu.cupy_types import DeviceArray, KernelFunction
 from sim_server.backends.gpu.device import Gpu, compiled, options, own_headers
 from sim_server.backends.gpu.device_values import DeviceValues
-from sim_server.backends.gpu.helper import FarVectors, Helper
+from sim_server.backends.gpu.helper import FarInverse, FarVectors, Helper
 from sim_server.backends.gpu.inverse.build_inverse import InverseBuilder, PartitionedInverse, builder_kernels
 from sim_server.backends.gpu.inverse.device_digits import LARGE, LargeFactors, digits_kernels
 from sim_server.backends.gpu.inverse.device_plan import DevicePlan, shared_bytes
@@ -342,22 +342,42 @@ class PcgSolver:
                 self._vectors[key] = plan.vectors()
         return True
 
-    def use(self, body: int, pattern: FactorPattern, inverse: PartitionedInverse, planes: int, step: int) -> None:
-        """Writes a factor into the host row of a body; it is in use once the row is uploaded."""
-        device_plan, row = self.plan(body, pattern, planes), self.bodies[body]
-        row["matrix"], row["scale"], row["factor_step"] = inverse.matrix, inverse.scale, step
-        if self._plan_in_row.get(body) is not device_plan:
-            self._plan_in_row[body] = device_plan
-            row["plan"], row["planes"] = device_plan.address, planes
-            self.reserve_vectors(body, device_plan)
-            for name, address in self._addresses(body, device_plan).items():
-                row[name] = address
-            self._factor_bytes[body] = device_plan.bytes
-        row["helper"] = 0
-        if self._helper and inverse.far:
-            far_plan = self.begin_plan(body, pattern, planes).result().far
-            assert far_plan is not None
-            row["helper"] = self._helper.use(row, inverse.far, far_plan, self._far_vectors[body, device_plan.address])
+    def use(
+        self, bodies: Sequence[int], pattern: FactorPattern, inverses: Sequence[PartitionedInverse], planes: int,
+        steps: Sequence[int],
+    ) -> None:  # fmt: skip
+        """Writes factors of one pattern into the host rows of bodies; each is in use once its row is uploaded."""
+        rows, chosen = self.bodies, list(bodies)
+        plans: dict[int, DevicePlan] = {}  # by number of thread blocks
+        for body in bodies:
+            if (blocks := self._blocks_of[body]) not in plans:
+                plans[blocks] = self.plan(body, pattern, planes)
+            if self._plan_in_row.get(body) is not plans[blocks]:
+                self._use_plan(body, plans[blocks], planes)
+        rows["matrix"][chosen] = [each.matrix for each in inverses]
+        rows["scale"][chosen] = [each.scale for each in inverses]
+        rows["factor_step"][chosen], rows["helper"][chosen] = steps, 0
+        if self._helper:
+            for body, inverse in zip(bodies, inverses, strict=True):
+                if inverse.far:
+                    self._use_far(body, pattern, inverse.far, planes)
+
+    def _use_plan(self, body: int, device_plan: DevicePlan, planes: int) -> None:
+        """Has a body use factors of another plan."""
+        row = self.bodies[body]
+        self._plan_in_row[body] = device_plan
+        row["plan"], row["planes"] = device_plan.address, planes
+        self.reserve_vectors(body, device_plan)
+        for name, address in self._addresses(body, device_plan).items():
+            row[name] = address
+        self._factor_bytes[body] = device_plan.bytes
+
+    def _use_far(self, body: int, pattern: FactorPattern, far: FarInverse, planes: int) -> None:
+        """Has a second GPU use its part of an inverse."""
+        assert self._helper is not None
+        planned, row = self.begin_plan(body, pattern, planes).result(), self.bodies[body]
+        assert planned.far is not None
+        row["helper"] = self._helper.use(row, far, planned.far, self._far_vectors[body, planned.plan.address])
 
     def _addresses(self, body: int, plan: DevicePlan) -> dict[str, int]:
         """Returns the addresses of the vectors of a body, by name."""
