@@ -306,7 +306,7 @@ class PcgSolver:
 
     def _planned(self, pattern: FactorPattern, blocks: int, planes: int) -> PlannedInverse:
         found = plan(pattern, blocks, planes=planes, shared=self._shared)
-        if (needed := shared_bytes(found)) > self._shared:
+        if (needed := shared_bytes(found, self.threads // 32)) > self._shared:
             raise ValueError(
                 f"{pattern.size} degrees of freedom in {blocks} thread blocks need {needed} bytes of shared memory "
                 f"each, allowed: {self._shared}"
@@ -317,9 +317,9 @@ class PcgSolver:
         builder = InverseBuilder(self.gpu, pattern, found, most, helper)
         if self.planes is None and 4 * pattern.nonzeros > LARGE:
             self._large.expect(pattern)
-        warps, own = self.threads // 32, blocks // 2 if helper else blocks
-        far = helper.plan(found, warps) if helper else None
-        return PlannedInverse(DevicePlan(self.gpu, found, warps, 0 if self._helper else None, own), builder, far)
+        own = blocks // 2 if helper else blocks
+        far = helper.plan(found) if helper else None
+        return PlannedInverse(DevicePlan(self.gpu, found, 0 if self._helper else None, own), builder, far)
 
     def reserve_vectors(self, body: int, plan: DevicePlan) -> bool:
         """Allocates the vectors of solves of a body with factors of this plan, unless they are there; returns whether
