@@ -94,28 +94,29 @@ class Copies:
         return self._call(_addresses(sources), _addresses(targets), size, item, own_sources)[:2]
 
     def take(
-        self, sources: Sequence[NDArray[Any]], memory: NDArray[Any], diagonals: Sequence[NDArray[np.int64]]
+        self, source: Parts, counts: NDArray[np.int64], memory: NDArray[Any], diagonals: Sequence[NDArray[np.int64]]
     ) -> tuple[list[int], list[bool], list[bool]]:  # fmt: skip
-        """Copies sources one behind the other into memory, of the same type and as many numbers. Returns of each copy
-        its `checksum` and `all_finite`, and whether the numbers on its diagonal are greater than 0.
+        """Copies parts of an array, of so many numbers of the type of `memory` each, one behind the other into memory
+        of as many numbers. Returns of each copy its `checksum` and `all_finite`, and whether the numbers on its
+        diagonal are greater than 0. Raises ValueError if a part lies outside of its array.
 
-        sources: may be written to meanwhile; what is returned is about the copies
-        diagonals: places in each source of what are to be positive; those of one array are read once
+        source: may be written to meanwhile; what is returned is about the copies
+        diagonals: places in each part of what are to be positive; those of one array are read once
         """
-        sizes = [each.size for each in sources]
-        ends = np.cumsum(sizes, dtype=np.int64)
-        if memory.dtype != sources[0].dtype or ends[-1] != memory.size or not memory.flags.c_contiguous:
-            raise ValueError(f"{memory.size} numbers of {memory.dtype} for {ends[-1]} of {sources[0].dtype}")
-        if len(diagonals) != len(sources):
-            raise ValueError(f"{len(diagonals)} diagonals of {len(sources)} arrays")
+        ends, item = np.cumsum(counts), memory.itemsize
+        if item not in (4, 8) or ends[-1] != memory.size or not memory.flags.c_contiguous:
+            raise ValueError(f"{memory.size} numbers of {memory.dtype} for {ends[-1]}")
+        if len(diagonals) != len(counts):
+            raise ValueError(f"{len(diagonals)} diagonals of {len(counts)} arrays")
+        size = counts * item
+        begin = source.addresses(size)
         if self._library is None:
             targets = np.split(memory, ends[:-1])
-            sums, finite = self.copy(sources, targets)
+            looked = [copied(s.view(memory.dtype), t, t) for s, t in zip(source.split(size), targets, strict=True)]
             own = zip(targets, diagonals, strict=True)
-            return sums, finite, [bool((target[places] > 0).all()) for target, places in own]
-        begin = np.array(address(memory) + (ends - sizes) * memory.itemsize, np.uintp)
-        size, item = _sizes(sources)
-        return self._call(_addresses(sources), begin, size, item, False, diagonals)
+            return [s for s, _ in looked], [f for _, f in looked], [bool((t[places] > 0).all()) for t, places in own]
+        to = (address(memory) + (ends - counts) * item).astype(np.uintp)
+        return self._call(begin, to, size, item, False, diagonals)
 
     def copy_parts(
         self, source: Parts, target: Parts, size: NDArray[np.int64], own_sources: bool = False

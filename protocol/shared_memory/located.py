@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Arrays that know their address, for what hands many of them to native code: NumPy takes 2 us to tell each."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -20,6 +21,11 @@ def address(array: NDArray[Any]) -> int:
     """
     known: int = getattr(array, "address", 0)
     return known or int(array.ctypes.data if array.dtype.names else array.__array_interface__["data"][0])
+
+
+def addresses(arrays: Sequence[Any]) -> NDArray[np.uintp]:
+    """Returns the address of each array, or of what else knows its own."""
+    return np.array([getattr(each, "address", 0) or address(each) for each in arrays], np.uintp)
 
 
 def rows(memory: NDArray[Any], counts: list[int]) -> list[NDArray[Any]]:

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from protocol.factor import Factor, FactorPattern
+from protocol.factors_together import FactorsTogether
 from sim_server.arrays import Float64, Int32, Int64
 from sim_server.backends.shared_memory import SharedMemory
 from sim_server.backends.state import StateArray
@@ -259,6 +260,9 @@ class Engine(Protocol):
 
     def post_factors(self, bodies: Sequence[int], factors: Sequence[Factor]) -> None:
         """Posts factors of different bodies, one of each. Their values do not change any more."""
+
+    def post_together(self, bodies: Sequence[int], factors: FactorsTogether) -> None:
+        """Posts factors that came together, as `post_factors`."""
 
     def prepare_for_factors(self) -> None:
         """Begins what the first factor would wait for, without waiting."""

@@ -15,6 +15,7 @@ import zenoh
 from protocol.channels import CHANNELS, name_in
 from protocol.counters import Counters
 from protocol.factor import Factor, FactorPattern
+from protocol.factors_together import FactorsTogether
 from protocol.messages_pb2 import Topology, WorkerInfo
 from protocol.refused import Refused
 from protocol.shared_memory.pool import Slot, SlotPool
@@ -32,7 +33,7 @@ from sim_server.network.worker_choice import WorkerChoice
 from sim_server.network.worker_registry import WorkerRegistry
 from sim_server.network.worker_reliability import WorkerReliability
 from sim_server.network.worker_timing import WorkerTiming
-from sim_server.updates.factor_source import FactorMemory, FactorSource, Job
+from sim_server.updates.factor_source import Check, FactorMemory, FactorSource, Job
 
 log = logging.getLogger(__name__)
 
@@ -167,9 +168,16 @@ class Dispatch(FactorSource):
     def poll(self) -> list[Factor]:
         """Returns the factors that arrived and passed all checks since the last call."""
         with self._lock:
-            self._receive()
+            together = self.poll_together()
             factors, self._intake.factors = self._intake.factors, []
-            return factors
+            return [*factors, *(factor for each in together for factor in each)]
+
+    def poll_together(self) -> list[FactorsTogether]:
+        """Returns those of messages of several; the next `poll` returns the others."""
+        with self._lock:
+            self._receive()
+            together, self._intake.together = self._intake.together, []
+            return together
 
     def patterns(self) -> list[tuple[str, FactorPattern]]:
         """Returns (object, pattern) of the patterns that came since the last call; each comes before its factors."""
@@ -187,6 +195,10 @@ class Dispatch(FactorSource):
     def use_memory(self, memory: FactorMemory) -> None:
         """Has large factors that arrive put into arrays that `memory` makes."""
         self.decoder.memory = memory
+
+    def check_with(self, begin: Callable[[Sequence[tuple[str, int]]], Check | None]) -> None:
+        """Has factors of messages checked in the thread that copies them."""
+        self._intake.begin_check = begin
 
     def worker_count(self) -> int:
         """Number of workers that may be given jobs, idle or busy."""

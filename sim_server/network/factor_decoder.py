@@ -5,13 +5,14 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cache
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 from weakref import WeakValueDictionary
 
 import numpy as np
 
 from protocol.channels import CHANNELS, MOST_JOBS, name_in
 from protocol.factor import Factor, FactorPattern, check_values
+from protocol.factors_together import FactorsTogether
 from protocol.messages_pb2 import DeviceSlot as DeviceSlotMessage
 from protocol.messages_pb2 import Factor as FactorMessage
 from protocol.messages_pb2 import FactorBatch, Topology
@@ -19,6 +20,7 @@ from protocol.messages_pb2 import FactorPattern as PatternMessage
 from protocol.messages_pb2 import Slot as SlotMessage
 from protocol.method import COMPLETE
 from protocol.refused import Refused
+from protocol.shared_memory.copies import Parts
 from protocol.shared_memory.located import rows
 from protocol.shared_memory.pool import Slot
 from protocol.validate import (
@@ -231,44 +233,43 @@ class FactorDecoder:
             raise Refused(f"FactorBatch.jobs has {count} numbers, texts {texts}; allowed: none or as many", "shape")
         return message
 
-    def decode_several(
-        self, message: FactorBatch, answers: Sequence[tuple[int, InFlightJob]]
-    ) -> list[Factor | Refused]:  # fmt: skip
-        """Returns the factors at some places of a message, or why one is refused. From any thread.
+    def decode_several(self, message: FactorBatch, answers: Sequence[tuple[int, InFlightJob]]) -> "DecodedFactors":
+        """Returns the factors at some places of a message, and why others are refused. From any thread.
 
         They are copied by one call of native code, one after another into one array.
         """
-        made: list[Factor | Refused] = [Refused("there is no factor", "malformed")] * len(answers)
+        refused: list[tuple[int, Refused]] = []
         columns = _AnswerColumns.of(message)
         found: list[tuple[int, int, InFlightJob, AnnouncedObject, FactorPattern]] = []
         for k, (place, job) in enumerate(answers):
             try:
                 found.append((k, place, job, *self._expected(columns, place, job)))
             except Refused as refusal:
-                made[k] = refusal
+                refused.append((k, refusal))
         if not found:
-            return made
+            return DecodedFactors([], refused)
         values, sums, finite, positive = self._taken([(job, pattern) for _, _, job, _, pattern in found])
+        good: dict[tuple[int, str], list[int]] = {}  # places in `found` by pattern and method
         looked = zip(found, values, sums, finite, positive, strict=True)
-        for (k, place, job, known, pattern), own, hashed, is_finite, is_positive in looked:
-            told, remedy = columns.checksums[place], columns.remedies[place]
+        for place, ((k, told, job, known, pattern), own, hashed, is_finite, is_positive) in enumerate(looked):
             try:
-                if hashed != told or not (is_finite and is_positive):
-                    check_values(own, pattern, told, (hashed, is_finite), is_positive)
-                made[k] = self._made(known, pattern, own, job, columns.seconds[place], remedy)
+                if hashed != columns.checksums[told] or not (is_finite and is_positive):
+                    check_values(own, pattern, columns.checksums[told], (hashed, is_finite), is_positive)
+                self._note_size(known, pattern, job)
+                good.setdefault((pattern.id, job.method), []).append(place)
             except Refused as refusal:
-                made[k] = refusal
-        return made
+                refused.append((k, refusal))
+        return DecodedFactors([_together(found, values, columns, places) for places in good.values()], refused)
 
     def _expected(
         self, columns: "_AnswerColumns", place: int, job: InFlightJob
     ) -> tuple[AnnouncedObject, FactorPattern]:  # fmt: skip
         """Returns the object and the pattern of one of the answers, which has room in its slot."""
-        seconds, nonzeros, id = columns.seconds[place], columns.nonzeros[place], columns.patterns[place]
-        if not 0 <= seconds < math.inf:
+        nonzeros, id = columns.nonzeros[place], columns.patterns[place]
+        if not 0 <= (seconds := columns.seconds[place]) < math.inf:
             raise Refused(f"FactorBatch.seconds has {seconds}; allowed: finite, 0 or more", "malformed")
         known = self._known(job)
-        pattern = known.pattern(id)
+        pattern = known.complete.patterns.get(id) or known.patterns.get(id)
         if pattern is None:
             raise Refused(f"FactorBatch.patterns has {id:016x}, which was not sent", "pattern")
         if nonzeros != pattern.nonzeros:
@@ -279,19 +280,20 @@ class FactorDecoder:
     def _taken(
         self, found: Sequence[tuple[InFlightJob, FactorPattern]]
     ) -> tuple[list[Float32 | Float64], list[int], list[bool], list[bool]]:  # fmt: skip
-        """Copies values of factors out of the slots allocated for jobs, which are of one type: they must not change any
+        """Copies values of factors out of the slot allocated for jobs, which are of one type: they must not change any
         more once they are checked. Returns them, and of each its checksum, whether all values are finite, and whether
         the diagonal is positive."""
-        dtype = np.dtype(found[0][0].dtype)
+        slot, dtype = _slot(found[0][0]), np.dtype(found[0][0].dtype)
         counts = [pattern.nonzeros for _, pattern in found]
         total = sum(counts)
         if total * dtype.itemsize > LARGE:
             memory = self.memory(1 << (total - 1).bit_length(), dtype)  # of few sizes, so that it is used again
         else:
             memory = np.empty(total, dtype)
-        memory = memory[:total]
-        sources = [_slot(job).part(job.first, dtype, count) for (job, _), count in zip(found, counts, strict=True)]
-        looked = native_copies().take(sources, memory, [pattern.diagonal for _, pattern in found])
+        memory, begin = memory[:total], np.array([job.first for job, _ in found], np.int64)
+        source = Parts(slot.part(0, np.uint8, slot.capacity), begin)
+        diagonals = [pattern.diagonal for _, pattern in found]
+        looked = native_copies().take(source, np.array(counts, np.int64), memory, diagonals)
         return rows(memory, counts), *looked
 
     def _factor(
@@ -306,14 +308,19 @@ class FactorDecoder:
         seconds: float, remedy: str,
     ) -> Factor:  # fmt: skip
         """Returns the factor of values that were checked."""
-        self._unsized.discard(job.object)
+        self._note_size(known, pattern, job)
+        return Factor(job.object, job.epoch, job.step, job.warp, pattern, values, job.worker, seconds, remedy[:200])
+
+    def _note_size(self, known: AnnouncedObject, pattern: FactorPattern, job: InFlightJob) -> None:
+        """Takes note of the pattern of a factor that was checked."""
+        if job.object in self._unsized:
+            self._unsized.discard(job.object)
         if job.method != COMPLETE:
             sizes = known.sizes.get(job.method, {})
             if pattern.id not in sizes:
                 known.sizes[job.method] = _with_last(sizes, pattern.id, pattern.nonzeros)
         elif pattern.id not in known.complete.sizes:
             self._share(known.complete, pattern)
-        return Factor(job.object, job.epoch, job.step, job.warp, pattern, values, job.worker, seconds, remedy[:200])
 
     def on_rejected(self, object: str, pattern: int) -> None:
         """Takes note that a factor of a pattern did not pass the check: until another one comes, no room is made for
@@ -369,6 +376,27 @@ class FactorDecoder:
         if header.object != name_in(channel, key, "object"):
             raise Refused(f"{message.DESCRIPTOR.name}.header.object is {header.object!r}, its key is {key}", "object")
         return self.objects[header.object]
+
+
+class DecodedFactors(NamedTuple):
+    """Of answers in a message: factors with their places among them, and places of others with why they are refused."""
+
+    good: list[tuple[list[int], FactorsTogether]]
+    refused: list[tuple[int, Refused]]
+
+
+def _together(
+    found: Sequence[tuple[int, int, InFlightJob, AnnouncedObject, FactorPattern]],
+    values: Sequence[Float32 | Float64], columns: "_AnswerColumns", places: Sequence[int],
+) -> tuple[list[int], FactorsTogether]:  # fmt: skip
+    """Returns some of the factors that were found, of one pattern and method, and their places among the answers."""
+    chosen = [found[place] for place in places]
+    jobs, told, first = [each[2] for each in chosen], [each[1] for each in chosen], chosen[0]
+    return [each[0] for each in chosen], FactorsTogether(
+        first[4], jobs[0].worker, jobs[0].method, [job.object for job in jobs], [job.epoch for job in jobs],
+        [job.step for job in jobs], [job.warp for job in jobs], [values[place] for place in places],
+        [columns.seconds[k] for k in told], [columns.remedies[k][:200] for k in told],
+    )  # fmt: skip
 
 
 @dataclass(frozen=True)

@@ -11,21 +11,22 @@ import zenoh
 
 from protocol.counters import Counters
 from protocol.factor import Factor
+from protocol.factors_together import FactorsTogether
 from protocol.messages_pb2 import Factor as FactorMessage
 from protocol.messages_pb2 import FactorBatch
 from protocol.refused import Refused
 from protocol.shared_memory.pool import Slot, SlotPool
 from sim_server.network.bookkeeping import Bookkeeping
+from sim_server.network.factor_decoder import DecodedFactors
 from sim_server.network.factor_fetch import AHEAD, FactorFetch
 from sim_server.network.leases import InFlightJob
+from sim_server.updates.factor_source import Check
 
 T = TypeVar("T")
 
 LARGE = 4 << 20  # bytes of a factor whose copy and checks take more than a few milliseconds
 LARGE_MESSAGE = 1 << 19  # bytes of the factors of a message, for which it takes a tenth of one: it comes often
 FETCHES = 2  # factors that arrive in parts at a time, each in memory of its own
-Results = list[Factor | Refused]
-"""Of decoding the factors of a message: each, or why it is refused."""
 
 
 class Decoding(NamedTuple):
@@ -62,7 +63,7 @@ class FactorIntake:
     """Checks answers against the jobs in flight, and collects their factors. Methods raise Refused.
 
     pool: shared memory for parts; None: they travel as bytes
-    factors: that passed all checks, until they are told
+    factors, together: that passed all checks, those that came alone and those of messages, until they are told
     """
 
     def __init__(
@@ -75,11 +76,13 @@ class FactorIntake:
         self._messages = ThreadPoolExecutor(1, "factors of messages")  # small ones, which wait for no large one
         self._fetching = ThreadPoolExecutor(FETCHES, "parts of factors")
         self.factors: list[Factor] = []
+        self.together: list[FactorsTogether] = []
         self._decoding: dict[int, Decoding] = {}  # beside the caller, by number of the job
-        self._together: deque[tuple[DecodedTogether, Future[Results]]] = deque()  # likewise, oldest first
+        self._together: deque[tuple[DecodedTogether, Future[DecodedFactors]]] = deque()  # likewise, oldest first
         self._beside: set[int] = set()  # numbers of their jobs
         self._fetches: set[int] = set()  # of these, the jobs whose factors come in parts
         self.wake: Callable[[], None] = lambda: None  # called in another thread when a factor is decoded
+        self.begin_check: Callable[[Sequence[tuple[str, int]]], Check | None] = lambda jobs: None  # (FactorSource)
 
     def fetched_from(self, worker: str) -> int:
         """Number of factors that are fetched from a worker part by part."""
@@ -128,36 +131,45 @@ class FactorIntake:
         answers = self._matched(message)
         if not answers:
             return
-        duration = self._duration(next(iter(answers.values()))[1]) / len(message.jobs)
+        duration = self._duration(answers[0][1]) / len(message.jobs)
         self._note_answer(message.worker)
-        good = []
-        for place, job in answers.values():
-            if self._book.leases.is_reassigned(job):
-                self._book.leases.finish(job)
-            elif failure := _failure(message, place):
-                self._take_factor(job, _no_factor, failure, 0.0, (True, True))
-            else:
-                good.append((place, job))
+        good = [(place, job) for place, job in answers if not self._ends(message, place, job)]
         seconds = [message.seconds[place] for place, _ in good]
         together = DecodedTogether([job for _, job in good], seconds, message.matrix_shared, duration)
-        decode = partial(self._all_decoded, message, good)
+        decode: Callable[[], DecodedFactors] = partial(self._all_decoded, message, good)
         if 4 * sum(message.nonzeros) <= LARGE_MESSAGE:
             return self._guarded(together.jobs, partial(self._take_together, together, decode))
+        if (check := self.begin_check([(job.object, job.step) for job in together.jobs])) is not None:
+            decode = partial(_checked, decode, check)
         self._together.append((together, self._begun(self._messages, decode)))
         self._beside.update(job.number for job in together.jobs)
 
-    def _matched(self, message: FactorBatch) -> dict[int, tuple[int, InFlightJob]]:
-        """Returns place and job of the answers that are of a job in flight and the first to it, by its number."""
-        found: dict[int, tuple[int, InFlightJob]] = {}
+    def _matched(self, message: FactorBatch) -> list[tuple[int, InFlightJob]]:
+        """Returns place and job of the answers that are of a job in flight and the first to it."""
+        leases, found, seen = self._book.leases, [], set()
+        flying = leases.by_worker.get(message.worker, {})
         for place, number in enumerate(message.jobs):
             try:
-                job = self._book.leases.match_answer(number, message.worker, None)
-                if number in found or self.is_decoded(job):
+                job = flying.get(number)
+                if job is None or leases.by_object.get(job.object) is not job:
+                    job = leases.match_answer(number, message.worker, None)  # which tells what is wrong
+                if number in seen or number in self._beside or number in self._decoding:
                     raise Refused(f"FactorBatch.jobs has {number}, already answered", "duplicate")
-                found[number] = place, job
+                seen.add(number)
+                found.append((place, job))
             except Refused as refusal:
                 self._counters.refuse(refusal)
         return found
+
+    def _ends(self, message: FactorBatch, place: int, job: InFlightJob) -> bool:
+        """Takes an answer that brings no factor that is waited for; False if it brings one."""
+        if self._book.leases.is_reassigned(job):
+            self._book.leases.finish(job)
+        elif failure := _failure(message, place):
+            self._take_factor(job, _no_factor, failure, 0.0, (True, True))
+        else:
+            return False
+        return True
 
     def _decoded(self, job: InFlightJob, decode: Callable[[], Factor]) -> Factor:
         """Returns the factor that `decode` returns. Whatever error it raises, the factor is refused and the run goes
@@ -169,15 +181,15 @@ class FactorIntake:
         except Exception as error:
             raise self._counters.unexpected(error, f"factor of {job.object} by worker {job.worker}") from error
 
-    def _all_decoded(self, message: FactorBatch, answers: Sequence[tuple[int, InFlightJob]]) -> Results:
+    def _all_decoded(self, message: FactorBatch, answers: Sequence[tuple[int, InFlightJob]]) -> DecodedFactors:
         """Returns what FactorDecoder.decode_several does, likewise."""
         try:
-            return list(self._book.decoder.decode_several(message, answers))
+            return self._book.decoder.decode_several(message, answers)
         except Exception as error:
             first, *others = [job.object for _, job in answers]
             and_more = f" and {len(others)} more" if others else ""
             refusal = self._counters.unexpected(error, f"factors of {first}{and_more} by worker {message.worker}")
-            return [refusal for _ in answers]
+            return DecodedFactors([], [(k, refusal) for k in range(len(answers))])
 
     def _begun(self, thread: ThreadPoolExecutor, decode: Callable[[], T]) -> Future[T]:
         """Has a thread decode, and who takes in factors woken at the end."""
@@ -283,32 +295,44 @@ class FactorIntake:
             return self._book.leases.finish(current)
         self._take_factor(current, each.take, "", each.seconds, by_slot)
 
-    def _take_together(self, together: DecodedTogether, results: Callable[[], Results]) -> None:
+    def _take_together(self, together: DecodedTogether, results: Callable[[], DecodedFactors]) -> None:
         """Takes the factors of a message that passed all checks, unless their jobs are over, and notes why others did
         not."""
-        leases, taken, seconds, decoded = self._book.leases, [], [], results()
+        decoded, by_slot = results(), (together.matrix_shared, True)
+        taken: list[tuple[list[InFlightJob], FactorsTogether]] = []
+        for places, factors in decoded.good:
+            jobs = [together.jobs[k] for k in places]
+            rows = [row for row, job in enumerate(jobs) if self._is_current(job)]
+            if len(rows) < len(jobs):
+                jobs, factors = [jobs[row] for row in rows], factors.of(rows)
+            if rows:
+                taken.append((jobs, factors))
+        self.together += [factors for _, factors in taken]
         try:
-            for job, told, result in zip(together.jobs, together.seconds, decoded, strict=True):
+            for _, factors in taken:
+                self._book.timing.record_all(factors.worker, factors.objects, together.duration, factors.seconds)
+        finally:  # they will be used
+            for jobs, factors in taken:
+                self._book.leases.finish_all(jobs, factors.seconds)
+        for jobs, factors in taken:
+            self._count(jobs[0], sum(values.nbytes for values in factors.values), by_slot, len(jobs))
+        for k, refusal in decoded.refused:
+            if self._is_current(job := together.jobs[k]):
                 try:
-                    current = leases.match_answer(job.number, job.worker, job.epoch)
-                    if leases.is_reassigned(current):
-                        leases.finish(current)
-                    elif isinstance(result, Refused):
-                        self._take_factor(current, partial(_refuse, result), "", 0.0, (together.matrix_shared, True))
-                    else:
-                        taken.append(current)
-                        seconds.append(told)
-                        self.factors.append(result)
-                except Refused as refusal:
-                    self._counters.refuse(refusal)
-            if taken:
-                self._book.timing.record_all(taken[0].worker, [j.object for j in taken], together.duration, seconds)
-        finally:  # their factors will be used
-            if taken:
-                leases.finish_all(taken, seconds)
-        if taken:
-            size = sum(factor.values.nbytes for factor in self.factors[-len(taken) :])
-            self._count(taken[0], size, (together.matrix_shared, True), len(taken))
+                    self._take_factor(job, partial(_refuse, refusal), "", 0.0, by_slot)
+                except Refused as told:
+                    self._counters.refuse(told)
+
+    def _is_current(self, job: InFlightJob) -> bool:
+        """True if the factor of a job, which was decoded, is waited for."""
+        leases = self._book.leases
+        if leases.by_object.get(job.object) is job and leases.by_worker.get(job.worker, {}).get(job.number) is job:
+            return True
+        try:
+            leases.finish(leases.match_answer(job.number, job.worker, job.epoch))  # another worker has it now
+        except Refused as refusal:
+            self._counters.refuse(refusal)
+        return False
 
     def _take_factor(
         self, job: InFlightJob, decode: Callable[[], Factor], failure: str, told: float, by_slot: tuple[bool, bool]
@@ -361,6 +385,14 @@ class FactorIntake:
 def _failure(message: FactorBatch, place: int) -> str:
     """Why a worker made no factor for a job of a batch; empty if it did."""
     return message.failures[place] if message.failures else ""
+
+
+def _checked(decode: Callable[[], DecodedFactors], check: Check) -> DecodedFactors:
+    """Returns factors of a message with what their check tells."""
+    decoded = decode()
+    for _, factors in decoded.good:
+        factors.reasons = check(factors)
+    return decoded
 
 
 def _no_factor() -> Factor:

@@ -1,8 +1,10 @@
 # SPDX-License-Identifier: MIT
 """What is known of the updates of one body: its solves, the job in flight, failures and factors."""
 
+from __future__ import annotations
+
 from collections.abc import Iterable, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -178,16 +180,16 @@ class FactorStatistics:
         self.cost.add(cost)
         self.newest = factor.step
         self.used += 1
-        self.note(factor, cost)
+        self.note(factor.step, factor.worker, cost, bool(factor.remedy))
 
-    def note(self, factor: Factor, cost: float) -> None:
+    def note(self, step: int, worker: str, cost: float, regularized: bool) -> None:
         """Remembers of a factor what stands in no table."""
-        if method := self.method(factor.step):
+        if (method := self.methods.get(step)) is not None:
             if (mean := self.cost_by_method.get(method.name)) is None:
                 mean = self.cost_by_method[method.name] = RunningMean()
             mean.add(cost)
-        _remember(self.workers, factor.step, factor.worker)
-        self.regularized += bool(factor.remedy)
+        _remember(self.workers, step, worker)
+        self.regularized += regularized
 
 
 class BodyUpdateState:
@@ -312,29 +314,43 @@ def on_sent(table: UpdateTable, rows: Sequence[int], steps: Sequence[int]) -> No
     table.excess_sent[row], table.excess[row] = table.excess[row], 0.0
 
 
-def on_checks(table: UpdateTable, states: Sequence[BodyUpdateState], steps: Sequence[int]) -> None:
+def on_checks(table: UpdateTable, rows: Sequence[int], steps: Sequence[int]) -> None:
     """Takes note that factors of different bodies, of some steps, have come, which are checked beside the steps: their
-    next matrices may be sent meanwhile. table: that of the states"""
-    row, made = np.array([state._index for state in states]), np.asarray(steps)
+    next matrices may be sent meanwhile."""
+    row, made = np.asarray(rows), np.asarray(steps)
     table.checked[row] = made
     table.in_flight[row] &= table.sent[row] != made
 
 
-def on_factors(
-    states: Sequence[BodyUpdateState], table: UpdateTable, factors: Sequence[Factor], step: int
-) -> list[bool]:  # fmt: skip
+class MadeFactors(NamedTuple):
+    """What is noted of factors, a column each: step of the matrix, time of the factorization [s], worker, and whether
+    the matrix was not positive definite."""
+
+    steps: Sequence[int]
+    seconds: Sequence[float]
+    workers: Sequence[str]
+    regularized: Sequence[bool]
+
+    @classmethod
+    def of(cls, factors: Sequence[Factor]) -> MadeFactors:
+        """Returns it of factors."""
+        workers, regularized = [factor.worker for factor in factors], [bool(factor.remedy) for factor in factors]
+        return cls([factor.step for factor in factors], [factor.seconds for factor in factors], workers, regularized)
+
+
+def on_factors(states: Sequence[BodyUpdateState], table: UpdateTable, made: MadeFactors, step: int) -> list[bool]:
     """Takes note of factors of different bodies, as BodyUpdateState.on_factor does of each, with costs in seconds.
 
     table: that of the states. step: during which they came
     """
-    seconds = [max(factor.seconds, MIN_SECONDS) for factor in factors]
-    bodies, made = ([state._index for state in states], [factor.step for factor in factors])
-    newer = table.on_factors(np.array(bodies, np.int64), np.array(made, np.int64), np.array(seconds, np.float64), step)
-    for state, factor, cost, better in zip(states, factors, seconds, newer, strict=True):
+    costs, bodies = [max(each, MIN_SECONDS) for each in made.seconds], [state._index for state in states]
+    newer = table.on_factors(np.array(bodies, np.int64), np.array(made.steps, np.int64), np.array(costs), step)
+    noted = zip(states, made.steps, made.workers, costs, made.regularized, newer, strict=True)
+    for state, own, worker, cost, regularized, better in noted:
         if state.job.positions:
             state.failures.assemblies = 0
         if better:
-            state.factors.note(factor, cost)
+            state.factors.note(own, worker, cost, regularized)
     return newer
 
 

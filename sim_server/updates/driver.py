@@ -19,15 +19,17 @@ from numpy.typing import NDArray
 
 from protocol.counters import Counters
 from protocol.factor import Factor
+from protocol.factors_together import FactorsTogether
 from protocol.method import Method
 from sim_server.arrays import Float64
 from sim_server.backends.base import Capability
 from sim_server.backends.cpu.structs import REACTION
 from sim_server.mechanics.world import Body
 from sim_server.simulation import Simulation
-from sim_server.updates.body_state import BodyUpdateState, on_checks, on_factors
+from sim_server.updates.body_state import BodyUpdateState, MadeFactors, on_checks, on_factors
 from sim_server.updates.factor_check import FactorCheck
 from sim_server.updates.factor_source import FactorSource, Inline, Job
+from sim_server.updates.many_factors import MANY, ManyFactors
 from sim_server.updates.patterns import Patterns
 from sim_server.updates.policies import make_policy
 from sim_server.updates.snapshots import SnapshotPool
@@ -38,7 +40,6 @@ from sim_server.updates.useless_factors import UselessFactors
 log = logging.getLogger(__name__)
 
 LARGE = 4 << 20  # bytes of a factor whose check takes more than a few milliseconds
-MANY = 8  # factors that came together, whose checks together take more than a few milliseconds
 CHECK_FAILED = "its check failed"  # begins the reason of a factor whose check ended in an error: no fault of its worker
 MAX_CAUSES = 20  # reasons of missing factors that are logged of an object, each once
 
@@ -80,7 +81,7 @@ class Driver:
         bounds = simulation.integrator.error_bounds
         self.table = table = UpdateTable(len(world.bodies))
         self.bodies = [BodyUpdateState(b, methods, self.counted, bounds[b.index], table) for b in world.bodies]
-        self._tuned = bool(methods)
+        self.tuned = bool(methods)  # `auto` chooses how systems are solved
         self.by_name = {s.body.name: s for s in self.bodies}
         self.wants_factors = self.solver.wants_factors
         if self.wants_factors:
@@ -96,7 +97,10 @@ class Driver:
         self.wake: Callable[[], None] = lambda: None  # called in another thread when `pump` has something to take up
         self.on_adopt: list[Callable[[Factor], Any]] = []  # called with every factor that the loop is given
         self.on_epoch: list[Callable[[Body, int], None]] = []  # called before the first job of an epoch of a body
+        self._many = ManyFactors(self)
         self.snapshots = SnapshotPool(simulation, self.source, self.policy.expected_latency)
+        if self.wants_factors and self.policy.free:
+            self.source.check_with(self._many.begin_check)
         self.useless_factors = UselessFactors(self)
         self.checks: list[FactorsUnderCheck] = []  # oldest first
         self._behind: list[Factor] = []  # that wait for the end of the check of the factor before them
@@ -167,7 +171,7 @@ class Driver:
             whose next matrix may go ahead of it, one alone: there are two places for copies. It does where factors
             have been of use and `auto` compares none
         """
-        tuners = [state.tuner for state in self.bodies] if self._tuned else []
+        tuners = [state.tuner for state in self.bodies] if self.tuned else []
         on_trial = [t is not None and t.wants_factor for t in tuners]
         compared = [t is not None and t.factorization.candidate is not None for t in tuners]
         return self.table.requests(self.engine.step, ahead, on_trial, compared)
@@ -217,6 +221,8 @@ class Driver:
         patterns that factors will have."""
         self._end_checks()
         self.expect_factors(source)
+        for together in source.poll_together() if self.policy.free else ():
+            self._many.adopt(together)
         behind, self._behind = self._behind, []
         if factors := [*behind, *source.poll()]:
             on_factors(factors)
@@ -253,7 +259,7 @@ class Driver:
             self._check_beside(together)
         elif together:
             at_once = [(f, self.snapshots.release(self.by_name[f.object], f.step)) for f in together]
-            self._take_up(together, self._reject_reasons(at_once))
+            self._take_up(together, self.reasons(len(at_once), self.check.reject_reasons, at_once))
         self.policy.on_job_end()
 
     def _may_check(self, state: BodyUpdateState, factor: Factor) -> bool:
@@ -263,28 +269,42 @@ class Driver:
         return self.table.checked[state.body.index] == NONE and (not large or self.engine.may_prepare(state.body.index))
 
     def _check_beside(self, factors: Sequence[Factor]) -> None:
-        states = [self.by_name[factor.object] for factor in factors]
-        held = [self.snapshots.hold(state, factor.step) for state, factor in zip(states, factors, strict=True)]
+        states, steps = [self.by_name[factor.object] for factor in factors], [factor.step for factor in factors]
+        held = [self.snapshots.hold(state, step) for state, step in zip(states, steps, strict=True)]
         checked = [(factor, matrix) for factor, (_, matrix) in zip(factors, held, strict=True)]
-        on_checks(self.table, states, [factor.step for factor in factors])
+        on_checks(self.table, [state.body.index for state in states], steps)
+
+        def begin() -> Future[list[str]]:
+            applied = self._prepare(factors[0]) if len(factors) == 1 else None
+            return self._checker.submit(self.reasons, len(checked), self.check.reject_reasons, checked, applied)
+
+        self._begin_check(factors, [memory for memory, _ in held], begin)
+
+    def check_together(
+        self, factors: FactorsTogether, memory: Sequence[Float64 | None], matrices: Sequence[Float64 | None]
+    ) -> None:  # fmt: skip
+        """Begins to check factors beside the caller. memory, matrices: as of FactorsUnderCheck, and of FactorCheck"""
+        check = partial(self._checker.submit, self.reasons, len(factors), self.check.reject_together)
+        self._begin_check(factors, memory, partial(check, factors, matrices))
+
+    def _begin_check(
+        self, factors: Sequence[Factor], memory: Sequence[Float64 | None], begin: Callable[[], Future[list[str]]]
+    ) -> None:  # fmt: skip
         reasons: Future[list[str]] = Future()
         try:
-            applied = self._prepare(factors[0]) if len(factors) == 1 else None
-            reasons = self._checker.submit(self._reject_reasons, checked, applied)
+            reasons = begin()
         except Exception as error:  # "can't start new thread", or of the device
             reasons.set_result(self._check_failed(error, len(factors)))
         reasons.add_done_callback(lambda _: self.wake())
-        self.checks.append(FactorsUnderCheck(factors, [memory for memory, _ in held], reasons))
+        self.checks.append(FactorsUnderCheck(factors, memory, reasons))
 
-    def _reject_reasons(
-        self, checked: Sequence[tuple[Factor, Float64 | None]], applied: Callable[[], Float64 | None] | None = None
-    ) -> list[str]:  # fmt: skip
-        """Returns what FactorCheck.reject_reasons does. Whatever error it raises, none of the factors is used, and the
-        run goes on. From any thread."""
+    def reasons(self, count: int, check: Callable[..., list[str]], *arguments: Any) -> list[str]:
+        """Returns why each of so many factors is not used, as a check tells. Whatever error it raises, none of them is,
+        and the run goes on. From any thread."""
         try:
-            return self.check.reject_reasons(checked, applied)
+            return check(*arguments)
         except Exception as error:
-            return self._check_failed(error, len(checked))
+            return self._check_failed(error, count)
 
     def _check_failed(self, error: Exception, factors: int) -> list[str]:
         """Counts an error of the check of some factors; returns why they are not used."""
@@ -315,16 +335,22 @@ class Driver:
             for memory in check.memory:
                 if memory is not None:
                     self.snapshots.recycle(memory)
-            good, reasons = [], []
-            for factor, reason in zip(check.factors, check.reasons.result(), strict=True):
-                if self.source.epoch(factor.object) not in (None, factor.epoch):
-                    self.engine.drop_factor(self.by_name[factor.object].body.index, factor)
-                    self.fail(factor.object, "it was of a mesh that was split since", step=factor.step)
-                    continue
-                good.append(factor)
-                reasons.append(reason)
-            self.policy.on_job_end()
-            self._take_up(good, reasons)
+            self.take_up(check.factors, check.reasons.result())
+
+    def take_up(self, factors: Sequence[Factor], reasons: Sequence[str]) -> None:
+        """Gives the loop factors whose check has ended. reasons: why each is not to be used; empty if it is"""
+        self.policy.on_job_end()
+        if isinstance(factors, FactorsTogether) and self._many.take_up(factors, reasons):
+            return
+        good, why = [], []
+        for factor, reason in zip(factors, reasons, strict=True):
+            if self.source.epoch(factor.object) not in (None, factor.epoch):
+                self.engine.drop_factor(self.by_name[factor.object].body.index, factor)
+                self.fail(factor.object, "it was of a mesh that was split since", step=factor.step)
+                continue
+            good.append(factor)
+            why.append(reason)
+        self._take_up(good, why)
 
     def _take_up(self, factors: Sequence[Factor], reasons: Sequence[str]) -> None:
         """Puts factors into the mailboxes of their bodies. reasons: why each is not to be used; empty if it is."""
@@ -346,16 +372,16 @@ class Driver:
         bodies = [self.by_name[factor.object].body.index for factor in posted]
         self.engine.post_factors(bodies, posted)
         for factor in posted:
-            self._tell(self.by_name[factor.object], factor)
+            self.tell(self.by_name[factor.object], factor)
 
     def _on_factors(self, factors: Sequence[Factor]) -> list[bool]:
         """Takes note of factors; returns which are newer than those of their bodies."""
         states, step = [self.by_name[factor.object] for factor in factors], self.engine.step
         if self.counted or len(factors) < MANY or len({factor.object for factor in factors}) < len(factors):
             return [state.on_factor(factor, step) for state, factor in zip(states, factors, strict=True)]
-        return on_factors(states, self.table, factors, step)
+        return on_factors(states, self.table, MadeFactors.of(factors), step)
 
-    def _tell(self, state: BodyUpdateState, factor: Factor) -> None:
+    def tell(self, state: BodyUpdateState, factor: Factor) -> None:
         """Tells observers, and `auto`, of a factor that the loop was given."""
         if not self.policy.free:
             state.factors.kept = replace(factor, values=factor.values.copy())

@@ -16,7 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from protocol.factor import Factor, FactorPattern
-from protocol.shared_memory.located import Located, address
+from protocol.factors_together import FactorsTogether
+from protocol.shared_memory.located import Located, address, addresses
 from sim_server.arrays import Int32
 from sim_server.backends.compiler import native
 from sim_server.backends.cpu import structs
@@ -74,6 +75,16 @@ class CheckedBody:
         return self.row_start is row_start and self.columns is columns and self.pattern is pattern
 
 
+class Checked(NamedTuple):
+    """Factors that are checked, by columns. matrices: values (blocks, 3, 3) that each was made from; None: not known"""
+
+    objects: Sequence[str]
+    epochs: Sequence[int]
+    patterns: Sequence[FactorPattern]
+    values: Sequence[NDArray[Any]]
+    matrices: Sequence[Reals | None]
+
+
 class FactorCheck:
     """Checks factors of some objects.
 
@@ -115,6 +126,18 @@ class FactorCheck:
         found = self._judged([checked[k] for k in fitting], applied)
         for k in np.flatnonzero(self._may_be_useless(found)).tolist():
             reasons[fitting[k]] = self._useless(*checked[fitting[k]], Probe(*found[k].tolist()))
+        return reasons
+
+    def reject_together(self, factors: FactorsTogether, matrices: Sequence[Reals | None]) -> list[str]:
+        """Returns what `reject_reasons` does, of factors that came together. matrices: that they were made from"""
+        sizes = [len(self._patterns.at(*each)[0]) - 1 for each in zip(factors.objects, factors.epochs, strict=True)]
+        if any(3 * nodes != factors.pattern.size for nodes in sizes):
+            return self.reject_reasons(list(zip(factors, matrices, strict=True)))
+        checked = Checked(factors.objects, factors.epochs, [factors.pattern] * len(factors), factors.values, matrices)
+        found = _probes(self._judge(checked, WITH_FACTOR | WITH_BLOCK_JACOBI))
+        reasons = [""] * len(factors)
+        for k in np.flatnonzero(self._may_be_useless(found)).tolist():
+            reasons[k] = self._useless(factors[k], matrices[k], Probe(*found[k].tolist()))
         return reasons
 
     def wrong_size(self, factor: Factor) -> str:
@@ -169,53 +192,61 @@ class FactorCheck:
         self, checked: Sequence[tuple[Factor, Reals | None]], applied: Callable[[], Reals | None] | None
     ) -> Reals:  # fmt: skip
         """Returns the columns of Probe, (k, 4)."""
-        out = np.zeros((len(checked), 5))
+        factors, matrices = [factor for factor, _ in checked], [matrix for _, matrix in checked]
+        objects, epochs = [f.object for f in factors], [f.epoch for f in factors]
+        patterns, values = [f.pattern for f in factors], [f.values for f in factors]
+        given = Checked(objects, epochs, patterns, values, matrices)
         if applied is None:
-            self._judge(checked, WITH_FACTOR | WITH_BLOCK_JACOBI, None, out)
-        else:  # block Jacobi meanwhile
-            self._judge(checked, WITH_BLOCK_JACOBI, None, out)
-            self._judge(checked, WITH_FACTOR, applied(), out)
-        za = np.where(out[:, 1:4:2] > 0, out[:, 1:4:2], np.inf)
-        energy = out[:, 0:4:2] ** 2 / za
-        return np.column_stack([out[:, 0], energy, out[:, 4]])
+            return _probes(self._judge(given, WITH_FACTOR | WITH_BLOCK_JACOBI))
+        unread = given._replace(values=[NO_VALUES] * len(values))  # those on a device would be copied
+        out = self._judge(unread, WITH_BLOCK_JACOBI)  # meanwhile
+        z = applied()
+        return _probes(out + self._judge(given if z is None else unread, WITH_FACTOR, z))
 
-    def _judge(
-        self, checked: Sequence[tuple[Factor, Reals | None]], parts: int, applied: Reals | None, out: Reals
-    ) -> None:  # fmt: skip
-        """Fills in parts of `out` (k, 5). applied: P^-1 r of the only factor, whose values are not read then"""
+    def _judge(self, checked: Checked, parts: int, applied: Reals | None = None) -> Reals:
+        """Returns what wf_judge_all finds, (k, 5), 0 but for some parts. applied: P^-1 r of the only factor, whose
+        values are not read then"""
         with self._lock:
-            self._judge_locked(checked, parts, applied, out)
+            return self._judge_locked(checked, parts, applied)
 
-    def _judge_locked(
-        self, checked: Sequence[tuple[Factor, Reals | None]], parts: int, applied: Reals | None, out: Reals
-    ) -> None:  # fmt: skip
-        bodies, count = [self._body(factor) for factor, _ in checked], len(checked)
-        read = bool(parts & WITH_FACTOR) and applied is None  # those on a device would be copied
-        values = [_contiguous(factor.values) if read else NO_VALUES for factor, _ in checked]
-        row_start, columns, r, patterns = np.array([body.addresses for body in bodies], np.uintp).T.copy()
-        factors = np.zeros(count, FACTOR)
-        factors["pattern"], factors["values"] = patterns, [address(each) for each in values]
-        factors["step"], factors["bytes"] = [f.step for f, _ in checked], [each.itemsize for each in values]
-        nodes = np.array([body.nodes for body in bodies], np.int32)
+    def _judge_locked(self, checked: Checked, parts: int, applied: Reals | None) -> Reals:
+        objects, epochs, patterns, values, matrices = checked
+        count, values = len(objects), [_contiguous(each) for each in values]
+        bodies = [self._body(*each) for each in zip(objects, epochs, patterns, strict=True)]
+        row_start, columns, r, pattern = np.array([body.addresses for body in bodies], np.uintp).T.copy()
+        factors, nodes = np.zeros(count, FACTOR), np.array([body.nodes for body in bodies], np.int32)
+        factors["pattern"], factors["values"] = pattern, addresses(values)
+        factors["bytes"] = [each.itemsize for each in values]
         if (needed := WORK * 3 * int(nodes.max())) > len(self._work):
             self._work = np.empty(needed)
-        matrices = np.array([0 if matrix is None else address(matrix) for _, matrix in checked], np.uintp)
-        z = np.full(count, 0 if applied is None else address(applied), np.uintp)
-        arrays = factors, nodes, row_start, columns, matrices, r, z, self._work, out
+        there = [k for k, matrix in enumerate(matrices) if matrix is not None]
+        known = np.zeros(count, np.uintp)  # addresses of matrices
+        known[there] = addresses([matrix for matrix in matrices if matrix is not None])
+        z, out = np.full(count, 0 if applied is None else address(applied), np.uintp), np.zeros((count, 5))
+        arrays = factors, nodes, row_start, columns, known, r, z, self._work, out
         _library().wf_judge_all(count, parts, *map(address, arrays))
+        return out
 
-    def _body(self, factor: Factor) -> CheckedBody:
-        row_start, columns = self._patterns.at(factor.object, factor.epoch)
-        known = self._bodies.get(factor.object)
-        if known is None or not known.fits(row_start, columns, factor.pattern):
-            known = CheckedBody(row_start, columns, self._vector(3 * (len(row_start) - 1)), factor.pattern)
-            self._bodies[factor.object] = known
+    def _body(self, name: str, epoch: int, pattern: FactorPattern) -> CheckedBody:
+        """Returns what is known of an object; while the lock is held."""
+        row_start, columns = self._patterns.at(name, epoch)
+        known = self._bodies.get(name)
+        if known is None or not known.fits(row_start, columns, pattern):
+            known = CheckedBody(row_start, columns, self._vector(3 * (len(row_start) - 1)), pattern)
+            self._bodies[name] = known
         return known
 
     def _vector(self, size: int) -> Reals:
         if size not in self._vectors:
             self._vectors[size] = np.random.default_rng(0).standard_normal(size)
         return self._vectors[size]
+
+
+def _probes(out: Reals) -> Reals:
+    """Returns the columns of Probe, (k, 4), of what native code has found, (k, 5)."""
+    za = np.where(out[:, 1:4:2] > 0, out[:, 1:4:2], np.inf)
+    energy = out[:, 0:4:2] ** 2 / za
+    return np.column_stack([out[:, 0], energy, out[:, 4]])
 
 
 def _contiguous(values: NDArray[Any]) -> NDArray[Any]:

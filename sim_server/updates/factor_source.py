@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from protocol.factor import Factor, FactorPattern
+from protocol.factors_together import FactorsTogether
 from protocol.method import Method
 from sim_server.arrays import Float64, Int32
 from sim_server.updates.patterns import Patterns
@@ -20,6 +21,8 @@ if TYPE_CHECKING:
     from precond_worker.factorization.registry import Factorization
 
 EXACT = Method()
+Check = Callable[[FactorsTogether], list[str]]
+"""Returns why each of some factors is not to be used; empty if it is. From any thread."""
 FactorMemory = Callable[[int, np.dtype[Any]], NDArray[Any]]
 
 
@@ -72,6 +75,10 @@ class FactorSource(Protocol):
     def poll(self) -> list[Factor]:
         """Returns the factors that arrived since the last call."""
 
+    def poll_together(self) -> list[FactorsTogether]:
+        """Returns those of them that came in messages of several; the next `poll` returns the others."""
+        return []
+
     @abstractmethod
     def failures(self) -> list[tuple[str, str]]:
         """Returns (object, reason) of the jobs that ended without a factor since the last call."""
@@ -82,6 +89,13 @@ class FactorSource(Protocol):
 
     def use_memory(self, memory: FactorMemory) -> None:
         """Has large factors that arrive put into arrays that `memory` makes, of their number of values and type."""
+        return
+
+    def check_with(self, begin: Callable[[Sequence[tuple[str, int]]], Check | None]) -> None:
+        """Has factors that are taken in beside the caller checked there.
+
+        begin: for the answers to jobs (object, step); returns what checks their factors, or None. From any thread
+        """
         return
 
     def worker_count(self) -> int:

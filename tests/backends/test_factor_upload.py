@@ -51,6 +51,7 @@ class Maker:
         self.waits: list[int] = []  # builds that were begun before each wait for new vectors
         self.fail: Exception | None = None
         self.thread = ThreadPoolExecutor(1)
+        self.unusable: set[int] = set()  # bodies for whose vectors there is no memory
         self.fine: set[int] = set()  # values whose inverses need 22 binary digits
         self.planes_used: list[int] = []
         self.each_known: list[set[tuple[int, int]]] = []  # of all calls
@@ -114,9 +115,12 @@ class Maker:
         self.each_known.append(kept)
 
     def use(
-        self, body: int, pattern: SimpleNamespace, inverse: PartitionedInverse, planes: int, step: int
+        self, bodies: list[int], planned: list[SimpleNamespace], inverses: list[PartitionedInverse], planes: int,
+        steps: list[int],
     ) -> None:  # fmt: skip
-        self.bodies["factor"] = inverse.storage[0]
+        if self.unusable.intersection(bodies):
+            raise NoMemory("no vectors")
+        self.bodies["factor"][bodies] = [each.storage[0] for each in inverses]
         self.planes_used.append(planes)
 
 
@@ -563,6 +567,7 @@ def many(parts, monkeypatch):
     scene, maker, _ = parts
     maker.bodies = np.zeros(module.MANY, maker.bodies.dtype)
     boxes = [Mailbox() for _ in maker.bodies]
+    monkeypatch.setattr(module, "post_all", Mailbox.post_all)
     stream = SimpleNamespace(synchronize=maker.wait)
     gpu = SimpleNamespace(cp=SimpleNamespace(cuda=SimpleNamespace(get_current_stream=lambda: stream)))
     return maker, FactorUpload(gpu, maker, scene.loop, [f"beam{k}" for k in range(len(boxes))], boxes), boxes
@@ -571,11 +576,15 @@ def many(parts, monkeypatch):
 class Mailbox:
     """A mailbox whose mail the test takes."""
 
-    taken, posted = False, 0
+    taken, posted, row, count = False, 0, b"", 0
 
-    def post(self, data: bytes, keep: Any = None, event: int | None = None) -> SimpleNamespace:
-        self.taken, self.posted = False, keep.step
-        return SimpleNamespace(taken=0)
+    @staticmethod
+    def post_all(
+        boxes: list["Mailbox"], data: np.ndarray, keep: list[Any], events: list[int]
+    ) -> list[SimpleNamespace]:  # fmt: skip
+        for box, row, kept in zip(boxes, data, keep, strict=True):
+            box.taken, box.posted, box.row, box.count = False, kept.step, row.tobytes(), box.count + 1
+        return [SimpleNamespace(taken=0) for _ in boxes]
 
 
 def test_of_factors_that_come_faster_than_they_are_built_the_newest_wait(many, monkeypatch):
@@ -623,6 +632,7 @@ def test_many_are_built_beside_the_caller(many):
     maker.thread.submit(lambda: None).result()
     upload.advance()
     assert [box.posted for box in boxes] == values and len(maker.events) == 2, "as many at a time as the builder takes"
+    assert [np.frombuffer(box.row, np.int64).tolist() for box in boxes] == [[value] for value in values]
     post_all(upload, [v + 10 for v in values])  # the mail waits: these do, too
     assert len(maker.storages) == len(boxes)
     for box in boxes:
@@ -631,6 +641,36 @@ def test_many_are_built_beside_the_caller(many):
     maker.thread.submit(lambda: None).result()
     upload.advance()
     assert [box.posted for box in boxes] == [v + 10 for v in values] and len(maker.storages) == 2 * len(boxes)
+
+
+def test_many_are_posted_by_the_thread_that_builds_them(many):
+    """Nobody has to look whether they are built."""
+    maker, upload, boxes = many
+    values = list(range(1, len(boxes) + 1))
+    post_all(upload, values)
+    maker.thread.submit(lambda: None).result()
+    assert [box.posted for box in boxes] == values
+    upload.advance()
+    assert [box.count for box in boxes] == [1] * len(boxes), "once"
+
+
+def test_what_fails_while_they_are_posted_is_told_to_who_serves_the_loop(many, monkeypatch):
+    maker, upload, boxes = many
+    post, broken = module.post_all, RuntimeError("broken")
+
+    def fails(*arguments: Any) -> Any:
+        raise broken
+
+    with monkeypatch.context() as patch:
+        patch.setattr(module, "post_all", fails)
+        post_all(upload, list(range(1, len(boxes) + 1)))
+        maker.thread.submit(lambda: None).result()
+    with pytest.raises(RuntimeError, match="broken"):
+        upload.advance()
+    upload.advance()
+    post_all(upload, values := [9] * len(boxes))
+    maker.thread.submit(lambda: None).result()
+    assert [box.posted for box in boxes] == values and module.post_all is post
 
 
 def test_of_several_of_one_body_among_many_the_last_one_is_used(many):
@@ -687,4 +727,18 @@ def test_one_of_many_that_cannot_be_used_is_told_alone(many, caplog):
     assert [box.posted for box in boxes] == [1, 0, *range(3, len(boxes) + 1)]
     assert [r.message for r in caplog.records] == [
         "object 'beam1': a factor cannot be used on the GPU: not enough GPU memory: full; it goes on with block Jacobi"
+    ]
+
+
+def test_one_of_many_that_has_no_vectors_is_told_alone(many, caplog):
+    maker, upload, boxes = many
+    maker.unusable = {1}
+    with caplog.at_level(logging.WARNING):
+        post_all(upload, list(range(1, len(boxes) + 1)))
+        maker.thread.submit(lambda: None).result()
+        upload.advance()
+    assert [box.posted for box in boxes] == [1, 0, *range(3, len(boxes) + 1)]
+    assert [r.message for r in caplog.records] == [
+        "object 'beam1': a factor cannot be used on the GPU: not enough GPU memory: no vectors; "
+        "it goes on with block Jacobi"
     ]

@@ -15,7 +15,7 @@ from sim_server.backends import ring_buffers
 from sim_server.backends.cpu.structs import REACTION, REACTION_KINDS
 from sim_server.backends.gpu import loop as loop_module
 from sim_server.backends.gpu.loop import BATCH, CAPACITY, FRAMES
-from sim_server.backends.gpu.mailbox import ChangeMailbox
+from sim_server.backends.gpu.mailbox import ChangeMailbox, post_all
 from sim_server.backends.gpu.structs import NEWTON_RESULT, PAIR_SUM, STAGE_RESULT
 from sim_server.backends.measured import Measured
 from sim_server.backends.rosenbrock import FORMS
@@ -298,6 +298,34 @@ def test_what_was_not_taken_can_be_withdrawn():
     scene.loop.run(1)
     assert not box.withdraw()
     assert scene.loop.records()["factor_step"].tolist() == [0, 10]
+
+
+def test_mail_that_is_posted_together_is_taken_as_if_it_were_posted_alone():
+    """Each waits for its own event, what was not taken is replaced, and its memory lives as long as it is used."""
+    scene = FakeScene(bodies=3)
+    boxes, event = scene.loop.mailboxes[3:], scene.device.event()
+
+    def post(values: list[int], events: list[int]) -> list[Any]:
+        rows = np.array(values, np.int64)[:, None].view(np.uint8)
+        return post_all(boxes[:3], rows, [None] * 3, events)
+
+    scene.device.begin(event)
+    done = scene.device.event()
+    scene.device.record(done)
+    first = post([5, 6, 7], [done] * 3)
+    second = post([8, 9, 10], [done, event, done])
+    gc.collect()
+    scene.loop.run(2)
+    assert [box.taken for box in boxes[:3]] == [True, False, True]
+    assert [mail.taken for mail in first] == [-1] * 3 and [mail.taken for mail in second] == [0, -1, 0]
+    scene.device.record(event)
+    scene.loop.run(1)
+    assert [box.taken for box in boxes[:3]] == [True] * 3 and second[1].taken == 2
+    assert scene.loop.records()["factor_step"].reshape(3, 3).tolist() == [[8, 0, 10], [8, 0, 10], [8, 9, 10]]
+    post([11, 12, 13], [done] * 3)
+    boxes[0].post(number(14))
+    scene.loop.run(1)
+    assert scene.factor.tolist() == [14, 12, 13]
 
 
 class Held:

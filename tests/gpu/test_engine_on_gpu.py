@@ -131,7 +131,7 @@ def test_settings_and_factors_are_taken_up_while_it_runs():
     sim.engine.records()
     sim.engine.loop.patient = 1
     planes = sim.engine.solver.planes_of([(factor.pattern, factor.values)])[0]
-    sim.engine.solver.plan(0, factor.pattern, planes)  # kernels that build inverses may be compiled for it
+    sim.engine.solver.begin_plan(0, factor.pattern, planes).result()  # kernels may be compiled for it
     records = []
     with running(sim) as thread:
         while thread.is_alive() and sim.engine.step < 32:

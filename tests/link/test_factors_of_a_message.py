@@ -9,6 +9,7 @@ import pytest
 
 from precond_worker.factorization.factorize import Analysis
 from protocol.channels import PROTOCOL, key
+from protocol.factor import Factor
 from protocol.messages_pb2 import FactorBatch, Header, Topology
 from protocol.messages_pb2 import Slot as SlotMessage
 from protocol.refused import Refused
@@ -71,14 +72,25 @@ def stage() -> SimpleNamespace:
 def refused(stage: SimpleNamespace) -> dict[str, str]:
     """Kinds of refusals by object; the others must have their own values."""
     kinds = {}
-    found = stage.decoder.decode_several(stage.message, stage.answers)
+    found = decoded(stage)
     for (_, job), each in zip(stage.answers, found, strict=True):
         if isinstance(each, Refused):
             kinds[job.object] = each.kind
         else:
             assert (each.object, each.step, each.worker, each.seconds) == (job.object, 5, "w", 0.25)
+            assert (each.method, each.pattern.id) == (job.method, MADE[KINDS[job.object]].pattern.id)
             np.testing.assert_array_equal(each.values, stage.values[job.object])
     return kinds
+
+
+def decoded(stage: SimpleNamespace) -> list[Factor | Refused]:
+    """The factor of each answer, or why it is refused."""
+    good, refused = stage.decoder.decode_several(stage.message, stage.answers)
+    found = dict(refused)
+    for places, factors in good:
+        assert len(places) == len(factors) and not found.keys() & set(places)
+        found |= dict(zip(places, factors, strict=True))
+    return [found[k] for k in range(len(stage.answers))]
 
 
 def test_they_are_copied_one_behind_the_other_into_memory_of_few_sizes(stage, monkeypatch):
@@ -94,7 +106,7 @@ def test_they_are_copied_one_behind_the_other_into_memory_of_few_sizes(stage, mo
     assert refused(stage) == {}
     total = sum(len(each) for each in stage.values.values())
     assert len(asked) == 1 and asked[0] & (asked[0] - 1) == 0 and total <= asked[0] < 2 * total
-    found = [each.values for each in stage.decoder.decode_several(stage.message, stage.answers)]
+    found = [each.values for each in decoded(stage)]
     ends = [each.ctypes.data + each.nbytes for each in found]
     assert [each.ctypes.data for each in found[1:]] == ends[:-1]
     stage.slot.bytes[:] = 0xFF

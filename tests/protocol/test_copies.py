@@ -66,18 +66,28 @@ def test_they_are_taken_in_one_behind_the_other_and_what_is_not_positive_is_foun
     places = [np.array([0]), np.array([], np.int64), shared, shared, np.array([4095]), np.array([0, 70_000])]
     sources[0][0], sources[1][:], sources[2][41] = 0, -1, -1  # only the first is looked at
     sources[3][59], sources[4][17], sources[5][-1] = -0.0, np.inf, np.nan
-    memory = np.full(sum(map(len, sources)), np.nan, dtype)
-    sums, finite, positive = made.take(sources, memory, places)
+    counts = np.array([len(each) for each in sources])
+    memory, room = np.full(counts.sum(), np.nan, dtype), counts * np.dtype(dtype).itemsize + 24
+    begin = np.cumsum(room) - room + 8  # gaps between them
+    slot = np.full(room.sum(), 0xFF, np.uint8)
+    for first, each in zip(begin.tolist(), sources, strict=True):
+        slot[first : first + each.nbytes] = each.view(np.uint8)
+    sums, finite, positive = made.take(Parts(slot, begin), counts, memory, places)
     assert memory.tobytes() == b"".join(each.tobytes() for each in sources)
     assert sums == [checksum(each) for each in sources]
     assert finite == [True] * 4 + [False] * 2
     assert positive == [False, True, True, False, True, False]
 
 
-def test_memory_of_another_size_or_type_is_a_mistake_of_the_caller(made):
-    for memory in (np.zeros(5), np.zeros(3), np.zeros(4, np.float32), np.zeros(8)[::2]):
+def test_memory_of_another_size_and_parts_outside_of_their_array_are_mistakes_of_the_caller(made):
+    counts, slot = np.array([4]), np.zeros(40, np.uint8)
+    made.take(Parts(slot, np.array([8])), counts, np.zeros(4), [np.array([0])])
+    for memory in (np.zeros(5), np.zeros(3), np.zeros(4, np.float16), np.zeros(8)[::2]):
         with pytest.raises(ValueError):
-            made.take([np.zeros(4)], memory, [np.array([0])])
+            made.take(Parts(slot, np.array([0])), counts, memory, [np.array([0])])
+    for begin in (-1, 9, 1 << 62):
+        with pytest.raises(ValueError, match="outside"):
+            made.take(Parts(slot, np.array([begin])), counts, np.zeros(4), [np.array([0])])
 
 
 def test_many_large_arrays_are_shared_by_threads(made, monkeypatch):

@@ -85,7 +85,7 @@ def _area(p, a, phase, block, forming, vectors, device):
     own_segments = a["segments"][part[0] : part[0] + part[1]]
     where = a["index"][part[0] : part[0] + part[1]]
     x = np.full(p.x_area, np.nan)
-    middle = lists[3 * p.phases + 2 + phase] if phase < p.groups else lists[phase]
+    middle = lists[2 * p.phases + 2 + phase] if phase < p.groups else lists[phase]
     for k in range(lists[phase], middle if forming else lists[phase + 1]):
         kind, begin, to, keep = own_segments[k]
         valid = np.arange(32) < keep >> 1
@@ -105,10 +105,11 @@ def _area(p, a, phase, block, forming, vectors, device):
 
 def _products(p, a, phase, block, chunks, x):
     part, lists = a["block_ranges"][block], a["lists"][block]
-    starts, split = lists[p.phases + 1 : 2 * p.phases + 2], lists[2 * p.phases + 2 + phase]
-    assert split >= 1
+    starts, chunks_before = lists[p.phases + 1 : 2 * p.phases + 2], 0
     for t in range(starts[phase], starts[phase + 1]):
-        chunk, to, count, out, rows, elsewhere = a["tiles"][part[2] + t][:6]
+        chunk, to, count, out, rows, elsewhere, before = a["tiles"][part[2] + t][:7]
+        assert before == chunks_before
+        chunks_before += count
         assert part[4] <= chunk and chunk + (rows // 8) * count * p.planes <= part[4] + part[5]
         for eight in range(rows // 8):
             tile = chunks[chunk + eight * count * p.planes :][:count]
@@ -128,7 +129,7 @@ def test_the_kernels_lists_apply_the_inverse(graph, blocks, trips, monkeypatch):
         thresholds = tuple(sizes[k * len(sizes) // groups] for k in range(1, groups))
         p = lay_out(tree, thresholds, blocks)
         chunks, scale = stored(s.pattern, s.factor, p, np.float64)
-        z = applied(DevicePlan(HostGpu, p, 8), chunks, scale, s.r)  # type: ignore[arg-type]
+        z = applied(DevicePlan(HostGpu, p), chunks, scale, s.r)  # type: ignore[arg-type]
         assert np.linalg.norm(z - s.z) <= 1e-11 * np.linalg.norm(s.z)
 
 
@@ -144,7 +145,7 @@ def test_two_devices_apply_it_with_what_each_writes_into_the_memory_of_the_other
         p = lay_out(tree, thresholds, blocks)
         chunks, scale = stored(s.pattern, s.factor, p, np.float64)
         half = blocks // 2
-        one, two = (DevicePlan(HostGpu, p, 8, device, half) for device in (0, 1))  # type: ignore[arg-type]
+        one, two = (DevicePlan(HostGpu, p, device, half) for device in (0, 1))  # type: ignore[arg-type]
         z = applied_by([(one, 0, half), (two, half, blocks)], chunks, scale, s.r)
         assert np.linalg.norm(z - s.z) <= 1e-11 * np.linalg.norm(s.z)
 
@@ -158,17 +159,6 @@ def test_each_contribution_has_a_reader_on_one_of_two_devices():
     assert ((found & near > 0) == (flipped & far > 0)).all() and ((found & far > 0) == (flipped & near > 0)).all()
     alone = FarFlags(p, p.blocks, 0)
     assert (alone.contributions() == near).all() and not alone.places().any(), "one device has all thread blocks"
-
-
-def test_tiles_of_one_warp_each_and_of_several():
-    s = system(GRAPHS["bar"])
-    for blocks, warps in ((1, 2), (16, 8), (132, 8)):
-        uploaded = DevicePlan(HostGpu, plan(s.pattern, blocks), warps)  # type: ignore[arg-type]
-        lists = uploaded.arrays["lists"].host
-        phases = uploaded.plan.phases
-        count, split = np.diff(lists[:, phases + 1 : 2 * phases + 2]), lists[:, 2 * phases + 2 : 3 * phases + 2]
-        shared = split > 1
-        assert (count * split <= 64)[shared].all() and (16 * count <= 32 * warps)[shared].all()
 
 
 def test_thread_blocks_are_shared_out_by_size():

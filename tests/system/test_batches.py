@@ -325,6 +325,37 @@ def test_answers_of_no_job_and_second_answers_are_refused_one_by_one(stage: Hand
     stage.driver.until(lambda: stage.made() == set(NAMES), "the last one")
 
 
+@pytest.mark.parametrize("known", [True, False])
+def test_large_batches_are_checked_where_they_are_decoded(
+    stage: Hand, monkeypatch: pytest.MonkeyPatch, known: bool
+) -> None:
+    """By what the driver gives for just these jobs, if it gives anything."""
+    monkeypatch.setattr(factor_intake, "LARGE_MESSAGE", 0)
+    asked: list[Any] = []
+    verdicts: dict[str, str] = {}
+
+    def begin(jobs: Any) -> Any:
+        asked.extend(jobs)
+        return check if known else None
+
+    def check(factors: Any) -> list[str]:
+        assert threading.current_thread() is not threading.main_thread()
+        return [f"of {name}" for name in factors.objects]
+
+    dispatch = stage.driver.link.dispatch
+    dispatch.check_with(begin)
+    real, found = dispatch.poll_together, []
+    monkeypatch.setattr(dispatch, "poll_together", lambda: [found.append(each) or each for each in real()])
+    batch = stage.batch()
+    stage.send(stage.answer(batch))
+    stage.driver.until(lambda: all_are_back(stage), "the factors")
+    for each in found:
+        verdicts |= dict(zip(each.objects, each.reasons or [""] * len(each), strict=True))
+    assert verdicts == {name: f"of {name}" if known else "" for name in NAMES}
+    assert sorted(name for name, _ in asked) == sorted(NAMES)
+    stage.check_factors()
+
+
 def test_large_batches_are_decoded_beside_the_caller(stage: Hand, monkeypatch: pytest.MonkeyPatch) -> None:
     """All count as large here. Meanwhile nothing is taken and second answers are refused; then each counts alone."""
     monkeypatch.setattr(factor_intake, "LARGE_MESSAGE", 0)

@@ -13,7 +13,7 @@ from sim_server.backends.cpu.structs import RECORD
 from sim_server.backends.kinds import Kind
 from sim_server.recording import messages
 from sim_server.service.telemetry import Telemetry
-from sim_server.updates.body_state import on_checks, on_factors
+from sim_server.updates.body_state import MadeFactors, on_checks, on_factors
 from sim_server.updates.driver import Driver
 from sim_server.updates.scheduler import pick
 from sim_server.updates.solve_observer import MIN_TOGETHER
@@ -121,11 +121,11 @@ def test_many_factors_say_what_each_says():
                     state.on_job(factor.step, Method())
                     state.job.in_flight, state.job.sent = True, factor.step
                     if checked[k]:  # beside the steps, and a newer matrix was sent meanwhile, or none
-                        on_checks(driver.table, [state], [factor.step])
+                        on_checks(driver.table, [state.body.index], [factor.step])
                         state.job.in_flight, state.job.sent = bool(newer[k]), factor.step + int(newer[k])
         expected = [one.bodies[k].on_factor(factor, step) for k, factor in factors.items()]
         states = [many.bodies[k] for k in factors]
-        assert on_factors(states, many.table, list(factors.values()), step) == expected
+        assert on_factors(states, many.table, MadeFactors.of(list(factors.values())), step) == expected
         assert noted(one) == noted(many)
     assert min(t.factors.used for t in one.bodies) > 5
     assert one.bodies[0].factors.cost_by_method and one.bodies[0].factors.regularized

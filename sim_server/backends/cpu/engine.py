@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from protocol.factor import Factor, FactorPattern
+from protocol.factors_together import FactorsTogether
 from sim_server.arrays import Float64, Int32, Int64
 from sim_server.backends.base import ArrayChange, Capability, Due, EngineInput, Launch
 from sim_server.backends.cpu import structs
@@ -308,6 +309,10 @@ class CpuEngine(Reports):
             buffer = self._mail[body].free_buffer(factor.pattern, factor.values.dtype)
             buffer.take(factor.values, factor.step)
             self._mail[body].post(buffer)
+
+    def post_together(self, bodies: Sequence[int], factors: FactorsTogether) -> None:
+        """Posts factors that came together, as `post_factors`."""
+        self.post_factors(bodies, factors)
 
     def prepare_for_factors(self) -> None:
         """Does nothing."""

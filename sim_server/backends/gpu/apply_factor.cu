@@ -117,7 +117,6 @@ struct FactorApplication {
             inverse.gather(phase, from, group.number, unit);
             __syncthreads();
             inverse.multiply(phase, from, group.number, unit);
-            if (phase + 1 < inverse.phases) __syncthreads();  // the vector has been read
         }
         for (int k = threadIdx.x; k < 3 * range.own; k += THREADS) {
             const FlagWord<float>* z = inverse.z + place(k);

@@ -11,12 +11,14 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import Future
 from contextlib import ExitStack
 from functools import partial
+from itertools import repeat
 from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from protocol.factor import Factor, FactorPattern
+from protocol.factors_together import FactorsTogether
 from sim_server.arrays import Float64
 from sim_server.backends.base import ArrayChange, Capability, EngineInput, Launch
 from sim_server.backends.cpu.structs import REACTION
@@ -256,6 +258,11 @@ class GpuEngine(DeviceLoop):
         self._factor_upload.post_many(
             [(body, f.pattern, f.values, f.step) for body, f in zip(bodies, factors, strict=True)]
         )
+
+    def post_together(self, bodies: Sequence[int], factors: FactorsTogether) -> None:
+        """Posts factors that came together, as `post_factors`."""
+        pattern = repeat(factors.pattern, len(bodies))
+        self._factor_upload.post_many(list(zip(bodies, pattern, factors.values, factors.steps, strict=True)))
 
     def prepare_for_factors(self) -> None:
         """Has the kernels that build inverses of factors compiled beside the caller, and the inverses planned whose

@@ -32,7 +32,7 @@ from sim_server.backends.gpu.inverse.apply_inverse import Applied
 from sim_server.backends.gpu.inverse.build_inverse import InverseBuilder, InverseStorage, PartitionedInverse
 from sim_server.backends.gpu.inverse.device_digits import LARGE, is_large
 from sim_server.backends.gpu.loop import DeviceLoop
-from sim_server.backends.gpu.mailbox import DeviceMailbox
+from sim_server.backends.gpu.mailbox import DeviceMailbox, post_all
 from sim_server.backends.gpu.solver import SETTINGS_BYTES, PcgSolver, PlannedInverse
 from sim_server.backends.gpu.structs import Mail
 
@@ -60,6 +60,7 @@ class UploadedFactor(NamedTuple):
     step: int
     pattern: FactorPattern
     planes: int
+    planned: PlannedInverse
 
     @property
     def kind(self) -> InverseKind:
@@ -67,7 +68,7 @@ class UploadedFactor(NamedTuple):
         return self.pattern.id, self.planes
 
 
-@dataclass(eq=False)
+@dataclass(eq=False, slots=True)
 class GivenFactor:
     """A factor that came. Its values do not change any more.
 
@@ -97,7 +98,7 @@ class GivenFactor:
         _tell(self.applied, applied)
 
 
-Work = tuple[int, GivenFactor, Mapping[InverseKind, InverseStorage | None]]
+Work = tuple[int, GivenFactor, Mapping[InverseKind, InverseStorage]]
 """A body, its factor, and by kind a storage that no step reads, if there is one."""
 
 
@@ -121,7 +122,8 @@ class ChosenPlan(NamedTuple):
         _tell(self.applied, applied)
 
 
-class Builds(NamedTuple):
+@dataclass(eq=False)
+class Builds:
     """Inverses that are built beside the caller.
 
     given: by body
@@ -168,6 +170,21 @@ class BodyUploads:
         """True if a build may begin: a storage is free, or will be made."""
         return self.posted is None and self.leaving is None and self.building is None and self.built is None
 
+    @property
+    def comes(self) -> bool:
+        """True if a factor waits, is being built, or is prepared."""
+        return self.queued is not None or self.building is not None or self.built is not None
+
+    def spare(self) -> dict[InverseKind, InverseStorage]:
+        """Returns a storage of each kind that no step reads, if there is one; only where a build may begin."""
+        used, found = self.in_use.storage if self.in_use else None, {}
+        for kind, made in self.storages.items():
+            for storage in made:
+                if storage is not used:
+                    found[kind] = storage
+                    break
+        return found
+
     def kinds(self, body: int) -> set[InverseKind]:
         """Kinds of inverses whose plans are needed, or may be. body: number of this one"""
         given = [each for each in (self.queued, self.building and self.building.given[body]) if each]
@@ -192,6 +209,7 @@ class FactorUpload:
         self._lock = threading.RLock()
         self._waiting: dict[int, None] = {}  # bodies with a queued factor, those that wait longest first
         self._builds: list[Builds] = []  # under way beside the caller
+        self._errors: list[Exception] = []  # of posting what was built there
         self._known: set[InverseKind] = set()  # of which storages were made
 
     def expect(self, body: int, pattern: FactorPattern) -> None:
@@ -280,7 +298,7 @@ class FactorUpload:
         with self._lock:
             waiting: dict[int, None] = {}  # in this order
             for body, pattern, values, step in given:
-                if not self._use_prepared(body, values):
+                if not (self._uploads[body].comes and self._use_prepared(body, values)):
                     self._enqueue(body, GivenFactor(pattern, values, step))
                     waiting[body] = None
             self._begin_queued([*self._waiting, *(body for body in waiting if body not in self._waiting)])
@@ -288,6 +306,8 @@ class FactorUpload:
     def advance(self) -> None:
         """Posts what was built beside the caller, and begins the builds that have waited for a storage."""
         with self._lock:
+            if self._errors:
+                raise self._errors.pop(0)
             for builds in [each for each in self._builds if each.made.done()]:
                 self._finish(builds)
             if self._waiting:
@@ -370,9 +390,7 @@ class FactorUpload:
         given, uploads.queued = uploads.queued, None
         assert given is not None
         self._waiting.pop(body, None)
-        used = uploads.in_use.storage if uploads.in_use else None
-        spare = {kind: next((s for s in made if s is not used), None) for kind, made in uploads.storages.items()}
-        return body, given, spare
+        return body, given, uploads.spare()
 
     def _begin_now(self, body: int) -> None:
         work = self._take_queued(body)
@@ -386,6 +404,8 @@ class FactorUpload:
     def _begin_beside(self, bodies: Sequence[int], together: bool = False) -> None:
         work = [self._take_queued(body) for body in bodies]
         builds = self._note([given for _, given, _ in work], bodies, together)
+        if together:
+            builds.made.add_done_callback(lambda _: self._finish_beside(builds))
         self._solver.beside(partial(self._choose_and_build, work, builds.made))
 
     def _note(self, given: Sequence[GivenFactor], bodies: Sequence[int], together: bool = False) -> Builds:
@@ -442,7 +462,7 @@ class FactorUpload:
             self._solver.beside(partial(self._end, chosen, made))
 
     def _built_ahead(
-        self, body: int, given: GivenFactor, spare: Mapping[InverseKind, InverseStorage | None]
+        self, body: int, given: GivenFactor, spare: Mapping[InverseKind, InverseStorage]
     ) -> tuple[int, UploadedFactor | Exception | None]:  # fmt: skip
         """Begins to build an inverse with as many digits as the one before had, and finds out meanwhile how many it
         needs. Returns the float16 numbers per entry that it needs, and what is made; None: it needs others."""
@@ -479,7 +499,8 @@ class FactorUpload:
                             made[place] = error
         finally:
             for each in chosen:
-                each.tell(None)
+                if each.applied is not None:
+                    each.tell(None)
         return made
 
     def _build_by(
@@ -510,9 +531,10 @@ class FactorUpload:
             inverses = builder.build_many(values, [storages[place] for place in some], multiprocessors)
             for place, inverse in zip(some, inverses, strict=True):
                 given, planes = chosen[place].given, chosen[place].planes
-                made[place] = UploadedFactor(inverse, storages[place], given.step, given.pattern, planes)
+                made[place] = UploadedFactor(inverse, storages[place], given.step, given.pattern, planes, planned)
             for place, inverse in zip(some, inverses, strict=True):
-                self._apply(builder, inverse, chosen[place])
+                if chosen[place].given.r is not None:
+                    self._apply(builder, inverse, chosen[place])
 
     def _new_storages(self, builder: InverseBuilder, count: int) -> list[InverseStorage]:
         """Makes storages for several inverses at once; none for one, or where there is too little memory."""
@@ -528,8 +550,9 @@ class FactorUpload:
     def _apply(self, builder: InverseBuilder, inverse: PartitionedInverse, chosen: ChosenPlan) -> None:
         """Begins to apply an inverse for the check of its factor, which goes without where that cannot be done: the
         inverse is there all the same, and the device writes into its storage."""
-        if chosen.given.r is None or chosen.given.dropped:  # dropped: nobody would keep the memory that it comes to
+        if chosen.given.dropped:  # nobody would keep the memory that it comes to
             return
+        assert chosen.given.r is not None
         try:
             chosen.tell(builder.apply(inverse, chosen.given.r, self._multiprocessors))
         except Exception as error:
@@ -544,49 +567,88 @@ class FactorUpload:
         idle = loop.realtime and 0 < loop.step_seconds < BUSY * loop.dt
         return None if idle else self._solver.spared
 
+    def _finish_beside(self, builds: Builds) -> None:
+        """Posts what was built in the thread that built it, unless that is done: mail is taken once the device has
+        built, and nobody need look at it before."""
+        with self._lock:
+            try:
+                if builds in self._builds:
+                    self._finish(builds)
+            except Exception as error:  # for who serves the loop
+                self._errors.append(error)
+
     def _finish(self, builds: Builds) -> None:
         """Posts what was built beside the caller."""
-        self._builds = [each for each in self._builds if each is not builds]
+        self._builds.remove(builds)
         if builds.made.exception() is not None:
             for body in builds.given:
                 self._uploads[body].building = None
+        given = builds.given.items()
+        self._post_all([(*each, made) for each, made in zip(given, builds.made.result(), strict=True)])
+
+    def _post(self, body: int, given: GivenFactor, made: UploadedFactor | Exception) -> None:
+        self._post_all([(body, given, made)])
+
+    def _post_all(self, built: Sequence[tuple[int, GivenFactor, UploadedFactor | Exception]]) -> None:
+        """Posts factors of different bodies, those that are wanted already, or warns of those that cannot be used.
+        Raises in the end what is neither of a factor nor lack of memory; all others are posted."""
+        wanted: dict[InverseKind, list[tuple[int, UploadedFactor]]] = {}
         errors = []
-        for (body, given), made in zip(builds.given.items(), builds.made.result(), strict=True):
-            self._uploads[body].building = None  # not before: the plans of those behind it are needed
-            try:
-                self._post(body, given, made)
-            except Exception as error:  # the others are posted all the same
-                errors.append(error)
+        for body, given, made in built:
+            uploads = self._uploads[body]
+            uploads.building = None  # not before: the plans of those behind it are needed
+            if isinstance(made, Exception):
+                errors += self._unusable(uploads, made)
+                continue
+            kind = made.kind
+            if not any(storage is made.storage for storage in uploads.storages.get(kind, ())):
+                self._keep(uploads, made)
+            if given.wanted:
+                wanted.setdefault(kind, []).append((body, made))
+            else:
+                uploads.built = None if given.dropped else (made, given)
+        for posted in wanted.values():
+            errors += self._use(posted)
         if errors:
             raise errors[0]
 
-    def _post(self, body: int, given: GivenFactor, made: UploadedFactor | Exception) -> None:
-        """Posts a factor, if it is wanted already, or warns if it cannot be used. Raises what is neither of the factor
-        nor lack of memory."""
-        uploads = self._uploads[body]
+    def _use(self, built: Sequence[tuple[int, UploadedFactor]]) -> list[Exception]:
+        """Posts factors of one kind; returns errors as `_unusable`."""
+        bodies, factors = [body for body, _ in built], [made for _, made in built]
+        planned, inverses = [made.planned for made in factors], [made.inverse for made in factors]
         try:
-            if isinstance(made, Exception):
-                raise made
-            self._keep(uploads, made)
-            if not given.wanted:
-                uploads.built = None if given.dropped else (made, given)
-                return
-            self._solver.use(body, given.pattern, made.inverse, made.planes, made.step)
-        except (ValueError, CompileError) as error:
-            self._warn(uploads, str(error))
-            return
+            self._solver.use(bodies, planned, inverses, factors[0].planes, [made.step for made in factors])
         except Exception as error:
-            if not no_memory_left(error):
-                raise
+            if len(built) == 1:
+                return self._unusable(self._uploads[bodies[0]], error)
+            return [each for one in built for each in self._use([one])]  # those that can be are used
+        self._mail(bodies, factors)
+        return []
+
+    def _mail(self, bodies: Sequence[int], factors: Sequence[UploadedFactor]) -> None:
+        """Posts the rows of bodies that have new factors."""
+        each = [self._uploads[body] for body in bodies]
+        rows = self._solver.bodies[list(bodies)].view(np.uint8).reshape(len(bodies), -1)[:, SETTINGS_BYTES:]
+        events = [made.inverse.event.ptr for made in factors]
+        mails = post_all([uploads.mailbox for uploads in each], rows, factors, events)
+        for uploads, made, mail in zip(each, factors, mails, strict=True):
+            if made.planes != uploads.planes:
+                self._tell(uploads, made.planes)
+            uploads.posted, uploads.mail = made, mail
+
+    def _unusable(self, uploads: BodyUploads, error: Exception) -> list[Exception]:
+        """Warns that a factor of a body cannot be used; returns the error if it is neither of the factor nor lack of
+        memory."""
+        if isinstance(error, ValueError | CompileError):
+            self._warn(uploads, str(error))
+        elif no_memory_left(error):
             self._warn(uploads, f"not enough GPU memory: {error}")
-            return
-        self._tell(uploads, made.planes)
-        uploads.posted = made
-        row = self._solver.bodies[body : body + 1].tobytes()[SETTINGS_BYTES:]
-        uploads.mail = uploads.mailbox.post(row, keep=made, event=made.inverse.event.ptr)
+        else:
+            return [error]
+        return []
 
     def _keep(self, uploads: BodyUploads, factor: UploadedFactor) -> None:
-        """Keeps the storage of a factor, and forgets those of kinds that are not used any more."""
+        """Keeps the new storage of a factor, and forgets those of kinds that are not used any more."""
         if factor.kind not in uploads.storages:
             in_use = uploads.in_use.kind if uploads.in_use else None
             outdated = [k for k in uploads.storages if k != in_use]
@@ -597,9 +659,7 @@ class FactorUpload:
             uploads.expected = None
             if outdated or factor.kind not in self._known:
                 self._forget_plans(factor.kind)
-        storages = uploads.storages.setdefault(factor.kind, [])
-        if all(storage is not factor.storage for storage in storages):
-            storages.append(factor.storage)
+        uploads.storages.setdefault(factor.kind, []).append(factor.storage)
 
     def _forget_plans(self, needed: InverseKind) -> None:
         """Forgets the plans of kinds that no body has. needed: one that is about to be used"""
@@ -607,10 +667,9 @@ class FactorUpload:
         self._solver.forget_plans(self._known)
 
     def _tell(self, uploads: BodyUploads, planes: int) -> None:
-        """Takes note of how many digits the inverse of a factor has, and logs it where that changes."""
-        if planes != uploads.planes:
-            uploads.planes = planes
-            log.info("object %r: its factors keep %d binary digits on the GPU from now on", uploads.name, 11 * planes)
+        """Takes note that inverses have another number of digits from now on, and logs it."""
+        uploads.planes = planes
+        log.info("object %r: its factors keep %d binary digits on the GPU from now on", uploads.name, 11 * planes)
 
     def _warn(self, uploads: BodyUploads, reason: str) -> None:
         if not uploads.warned:

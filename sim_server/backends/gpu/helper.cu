@@ -95,7 +95,6 @@ __device__ __forceinline__ double apply(const Command& c) {
         __syncthreads();
         mine += inverse.multiply(phase, from, c.number, c.unit);
         from = {inverse.residual + c.later * half, c.number, 0, 0};
-        __syncthreads();  // the vector has been read
     }
     return mine;
 }

@@ -209,10 +209,10 @@ class Helper:
         """Allocates memory for its part of an inverse."""
         return FarInverse(self, plan)
 
-    def plan(self, plan: Plan, warps: int) -> DevicePlan:
+    def plan(self, plan: Plan) -> DevicePlan:
         """Returns a plan in the helper's memory."""
         with self.device:
-            made = DevicePlan(self.gpu, plan, warps, 1, plan.blocks // 2)
+            made = DevicePlan(self.gpu, plan, 1, plan.blocks // 2)
             self.cp.cuda.get_current_stream().synchronize()
             return made
 

@@ -42,7 +42,6 @@ __device__ __forceinline__ void apply(const IslandArguments& a, const Partitione
         inverse.gather(phase, from, group.number, unit);
         __syncthreads();
         inverse.multiply(phase, from, group.number, unit);
-        if (phase + 1 < inverse.phases) __syncthreads();  // the vector has been read
     }
     for (int k = threadIdx.x; k < 3 * range.own; k += THREADS) {
         const FlagWord<float>* z = inverse.z + memory.plan.place[range.begin + k / 3] + k % 3;

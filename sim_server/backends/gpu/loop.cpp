@@ -333,6 +333,12 @@ Mail* wf_gpu_post(GpuLoop* loop, MailSlot* slot, Mail* mail) {
     return before;
 }
 
+// Posts mail into different slots. displaced: of each, 1: what was there was not taken
+void wf_gpu_post_all(GpuLoop* loop, int64_t count, MailSlot* const* slots, Mail* mail, uint8_t* displaced) {
+    for (int64_t k = 0; k < count; ++k) displaced[k] = slots[k]->posted.exchange(mail + k) != nullptr;
+    loop->posted.store(1, std::memory_order_release);
+}
+
 // Starts the balances of some bodies. starts: first node of each and the end of the last one. mass: of the nodes [kg]. x, v: of type
 // double, or float where `single`. dt [s].
 void wf_gpu_start_balances(int64_t count, const int64_t* bodies, Balance* balance, const int32_t* starts, const double* mass, const void* x,

@@ -11,6 +11,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
+from protocol.shared_memory.located import Located, address
 from sim_server.arrays import Float64, Int64
 from sim_server.backends.base import Due
 from sim_server.backends.gpu import structs
@@ -135,8 +136,8 @@ class DeviceLoop(Reports):
         loop.context, loop.stream, loop.copy_stream = device.context, device.stream, device.copies
         loop.mail_slots, loop.mail_slot_count = c.addressof(self._slots), len(mailboxes)
         loop.readbacks, loop.bodies = c.addressof(self._readbacks), bodies
-        for name, address in addresses.items():
-            setattr(loop, name, address)
+        for name, where in addresses.items():
+            setattr(loop, name, where)
         loop.capacity, loop.batch, loop.batch_seconds, loop.poll = CAPACITY, BATCH, BATCH_SECONDS, POLL
         loop.sizes[:] = GRAPH_STEPS
         loop.frame_bytes, loop.clock, loop.matrix_step = frame, clock.ctypes.data, -1
@@ -297,8 +298,10 @@ class DeviceLoop(Reports):
     def _memory_at(self, body: int, place: int) -> Float64:
         """Returns the memory of copies of a body's matrix from byte `place` on."""
         if (own := self._own_memory.get(place)) is None:
-            memory = self._staging()[place : place + self._room[body]]
-            own = self._own_memory[place] = memory.view(np.float64).reshape(-1, 3, 3)
+            staging = self._staging()
+            memory = staging[place : place + self._room[body]].view(np.float64).reshape(-1, 3, 3).view(Located)
+            memory.address = address(staging) + place
+            own = self._own_memory[place] = memory
         return own
 
     def _other_place(self, body: int) -> int:

@@ -12,6 +12,8 @@ from numpy.typing import NDArray
 from sim_server.backends.compiler import native
 from sim_server.backends.gpu import structs
 
+MAIL = structs.LOOP.dtype("Mail")
+
 
 @cache
 def library() -> c.CDLL:
@@ -36,6 +38,14 @@ def _posting() -> Any:
     """The function that posts mail. It keeps Python's lock, which takes longer to get back than to post."""
     held = c.PyDLL(library()._name).wf_gpu_post
     held.restype, held.argtypes = c.c_void_p, [c.c_void_p, c.c_void_p, c.c_void_p]
+    return held
+
+
+@cache
+def _posting_all() -> Any:
+    """Likewise, into several mailboxes."""
+    held = c.PyDLL(library()._name).wf_gpu_post_all
+    held.restype, held.argtypes = None, [c.c_void_p, c.c_int64, *[c.c_void_p] * 3]
     return held
 
 
@@ -85,9 +95,11 @@ class DeviceMailbox:
     """
 
     def __init__(self, loop: structs.GpuLoop, slot: structs.MailSlot):
-        self._loop, self._slot, self.number = loop, slot, 0
-        self._own = c.addressof(loop), c.addressof(slot)
-        self._kept: list[Any] = []  # mail in use, then mail posted
+        self.loop, self._slot, self.number = loop, slot, 0
+        self._own = _, self.address = c.addressof(loop), c.addressof(slot)
+        self.size = int(slot.size)
+        self._used: Any = None  # mail in use
+        self._waiting: Any = None  # mail posted, which may be in use since
         self._leaving: list[tuple[int, Any]] = []  # (steps after whose completion it is out of use, mail)
 
     def post(self, data: bytes, keep: Any = None, event: int | None = None) -> structs.Mail:
@@ -96,20 +108,27 @@ class DeviceMailbox:
         keep: objects that the bytes point to. event: handle of the event.
         The bytes are valid from the step after the result's `taken` steps, once that is not below 0.
         """
-        assert len(data) == self._slot.size
+        assert len(data) == self.size
         self.number += 1
         memory = c.create_string_buffer(data, len(data))
         mail = structs.Mail(c.addressof(memory), event, self.number, -1)
-        displaced = _posting()(*self._own, c.addressof(mail))
-        if self._leaving:
-            self._leaving = [(step, what) for step, what in self._leaving if step > self._loop.step]
-        if displaced:
-            self._kept.pop()  # never taken; the mail in use stays
-        elif len(self._kept) > 1:  # the last one was taken: those before it are out of use after the steps under way
-            self._leaving.append((int(self._loop.launched), self._kept[:-1]))
-            del self._kept[:-1]
-        self._kept.append((memory, mail, keep))
+        displaced = bool(_posting()(*self._own, c.addressof(mail)))
+        self.note(displaced, (memory, mail, keep), self.loop.step, self.loop.launched)
         return mail
+
+    def note(self, displaced: bool, kept: Any, step: int, launched: int) -> None:
+        """Keeps what was posted last.
+
+        displaced: what was posted before was not taken
+        step, launched: steps completed, and launched
+        """
+        if self._leaving:
+            self._leaving = [each for each in self._leaving if each[0] > step]
+        if not displaced and self._waiting is not None:  # it was taken: what was used before leaves after those steps
+            if self._used is not None:
+                self._leaving.append((launched, self._used))
+            self._used = self._waiting
+        self._waiting = kept
 
     def withdraw(self) -> bool:
         """Takes back mail that was not copied to the device, while the loop stands still; True if there was any."""
@@ -117,10 +136,35 @@ class DeviceMailbox:
         back = back or bool(self._slot.pending)
         self._slot.pending = None
         if back:
-            self._kept.pop()
+            self._waiting = None
         return back
 
     @property
     def taken(self) -> bool:
         """True if the copy of the last mail to the device has begun."""
         return bool(self._slot.taken == self.number)
+
+
+def post_all(
+    boxes: Sequence[DeviceMailbox], data: NDArray[np.uint8], keep: Sequence[Any], events: Sequence[int]
+) -> list[structs.Mail]:  # fmt: skip
+    """Posts into different mailboxes of one loop, as DeviceMailbox.post does into each, by one call of native code.
+
+    data: bytes of each, (boxes, bytes)
+    """
+    count, data, loop = len(boxes), np.ascontiguousarray(data), boxes[0].loop
+    assert data.shape == (count, boxes[0].size)
+    memory: Any = (structs.Mail * count)()
+    displaced = np.empty(count, np.bool_)
+    for box in boxes:
+        box.number += 1
+    table: NDArray[Any] = np.frombuffer(memory, MAIL)
+    table["bytes"], table["event"] = data.ctypes.data + data.shape[1] * np.arange(count), events
+    table["number"], table["taken"] = [box.number for box in boxes], -1
+    slots = np.array([box.address for box in boxes], np.uintp)
+    own = c.addressof(loop), count, slots.ctypes.data, c.addressof(memory), displaced.ctypes.data
+    _posting_all()(*own)
+    mails, step, launched = list(memory), loop.step, loop.launched
+    for box, mail, kept, displaces in zip(boxes, mails, keep, displaced.tolist(), strict=True):
+        box.note(displaces, (data, mail, kept), step, launched)
+    return mails

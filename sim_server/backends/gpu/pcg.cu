@@ -539,7 +539,9 @@ struct PcgSolver {
             mine += inverse.multiply(phase, from, group.number, unit);
 #endif
             from = {residuals(1 - turn), group.number, 0, 0};
-            if (phase + 1 < inverse.phases) __syncthreads();  // the vector has been read
+#ifdef ALONE
+            if (phase + 1 < inverse.phases) __syncthreads();  // the vector has been read, and words are in order
+#endif
         }
 #ifdef CORRECTED
         if (column >= 0) return mine;

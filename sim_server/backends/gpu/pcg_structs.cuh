@@ -17,8 +17,9 @@ struct __align__(16) WarpSegment {
 };
 
 // Eight or sixteen rows of a part's matrix: `chunks` chunks of 8 rows x 32 columns from `chunk` on, then those of the other
-// eight rows. x: first entry of the vector; out: first result; elsewhere, -DHELPED: the other device reads the results, too.
-struct __align__(16) Tile { int chunk, x, chunks, out, rows, elsewhere, unused[2]; };
+// eight rows. x: first entry of the vector; out: first result; elsewhere, -DHELPED: the other device reads the results, too; before: chunks
+// of the tiles before it in its list.
+struct __align__(16) Tile { int chunk, x, chunks, out, rows, elsewhere, before, unused; };
 
 // First and number of the segments, tiles and chunks of a thread block.
 struct BlockRanges { int segment, segments, tile, tiles, chunk, chunks, unused[2]; };
@@ -27,8 +28,8 @@ struct BlockRanges { int segment, segments, tile, tiles, chunk, chunks, unused[2
 struct DevicePlan {
     int phases, blocks, groups, size;
     const BlockRanges* block_ranges;  // (blocks,)
-    const int* lists;                 // (blocks, 4 phases + 2) of each phase: first segment (and the end), first tile (and the end), both
-                                      // within the part; warps that share a tile; first segment that is not formed here
+    const int* lists;                 // (blocks, 3 phases + 2) of each phase: first segment (and the end), first tile (and the end), both
+                                      // within the part; first segment that is not formed here
     const WarpSegment* segments;
     const Tile* tiles;
     const int* index;                 // (segments, 32) of each entry: its position (kinds 1 and 2), or the first of its contributions

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from protocol.shared_memory.located import Located, address
+from protocol.shared_memory.located import Located, addresses
 from sim_server.backends.gpu.device_values import DeviceValues
 
 
@@ -41,14 +41,8 @@ def is_pinned(array: NDArray[Any] | DeviceValues) -> bool:
 def runs(arrays: Sequence[NDArray[Any] | DeviceValues]) -> list[tuple[int, int, int]]:
     """Returns the copies that put arrays one behind the other, one for arrays that lie so already: first byte of the
     target, address of the source, bytes."""
-    found: list[tuple[int, int, int]] = []
-    begin = 0
-    for each in arrays:
-        place, size = each.address if isinstance(each, DeviceValues) else address(each), each.nbytes
-        if found and found[-1][1] + found[-1][2] == place:
-            first, source, length = found[-1]
-            found[-1] = first, source, length + size
-        else:
-            found.append((begin, place, size))
-        begin += size
-    return found
+    places, sizes = addresses(arrays).astype(np.int64), np.array([each.nbytes for each in arrays], np.int64)
+    begins = np.cumsum(sizes) - sizes
+    first = np.flatnonzero(np.append(True, places[1:] != places[:-1] + sizes[:-1]))
+    lengths = np.add.reduceat(sizes, first)
+    return list(zip(begins[first].tolist(), places[first].tolist(), lengths.tolist(), strict=True))

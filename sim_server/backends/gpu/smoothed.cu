@@ -146,7 +146,6 @@ struct SmoothedSolver {
             inverse.gather(phase, from, group.number, unit);
             __syncthreads();
             inverse.multiply(phase, from, group.number, unit);
-            __syncthreads();  // the vector has been read
         }
     }
 

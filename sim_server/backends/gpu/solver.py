@@ -17,7 +17,7 @@ from sim_server.backends.compiler import SOURCES
 from sim_server.backends.gpu.cupy_types import DeviceArray, KernelFunction
 from sim_server.backends.gpu.device import Gpu, compiled, options, own_headers
 from sim_server.backends.gpu.device_values import DeviceValues
-from sim_server.backends.gpu.helper import FarVectors, Helper
+from sim_server.backends.gpu.helper import FarInverse, FarVectors, Helper
 from sim_server.backends.gpu.inverse.build_inverse import InverseBuilder, PartitionedInverse, builder_kernels
 from sim_server.backends.gpu.inverse.device_digits import LARGE, LargeFactors, digits_kernels
 from sim_server.backends.gpu.inverse.device_plan import DevicePlan, shared_bytes
@@ -306,7 +306,7 @@ class PcgSolver:
 
     def _planned(self, pattern: FactorPattern, blocks: int, planes: int) -> PlannedInverse:
         found = plan(pattern, blocks, planes=planes, shared=self._shared)
-        if (needed := shared_bytes(found)) > self._shared:
+        if (needed := shared_bytes(found, self.threads // 32)) > self._shared:
             raise ValueError(
                 f"{pattern.size} degrees of freedom in {blocks} thread blocks need {needed} bytes of shared memory "
                 f"each, allowed: {self._shared}"
@@ -317,16 +317,9 @@ class PcgSolver:
         builder = InverseBuilder(self.gpu, pattern, found, most, helper)
         if self.planes is None and 4 * pattern.nonzeros > LARGE:
             self._large.expect(pattern)
-        warps, own = self.threads // 32, blocks // 2 if helper else blocks
-        far = helper.plan(found, warps) if helper else None
-        return PlannedInverse(DevicePlan(self.gpu, found, warps, 0 if self._helper else None, own), builder, far)
-
-    def plan(self, body: int, pattern: FactorPattern, planes: int) -> DevicePlan:
-        """Returns the plan of the inverse of factors of this pattern for a body; waits until it is made.
-
-        Raises ValueError if the pattern has no plan (inverse.plan.plan) or needs more shared memory than there is.
-        """
-        return self.begin_plan(body, pattern, planes).result().plan
+        own = blocks // 2 if helper else blocks
+        far = helper.plan(found) if helper else None
+        return PlannedInverse(DevicePlan(self.gpu, found, 0 if self._helper else None, own), builder, far)
 
     def reserve_vectors(self, body: int, plan: DevicePlan) -> bool:
         """Allocates the vectors of solves of a body with factors of this plan, unless they are there; returns whether
@@ -342,22 +335,38 @@ class PcgSolver:
                 self._vectors[key] = plan.vectors()
         return True
 
-    def use(self, body: int, pattern: FactorPattern, inverse: PartitionedInverse, planes: int, step: int) -> None:
-        """Writes a factor into the host row of a body; it is in use once the row is uploaded."""
-        device_plan, row = self.plan(body, pattern, planes), self.bodies[body]
-        row["matrix"], row["scale"], row["factor_step"] = inverse.matrix, inverse.scale, step
-        if self._plan_in_row.get(body) is not device_plan:
-            self._plan_in_row[body] = device_plan
-            row["plan"], row["planes"] = device_plan.address, planes
-            self.reserve_vectors(body, device_plan)
-            for name, address in self._addresses(body, device_plan).items():
-                row[name] = address
-            self._factor_bytes[body] = device_plan.bytes
-        row["helper"] = 0
-        if self._helper and inverse.far:
-            far_plan = self.begin_plan(body, pattern, planes).result().far
-            assert far_plan is not None
-            row["helper"] = self._helper.use(row, inverse.far, far_plan, self._far_vectors[body, device_plan.address])
+    def use(
+        self, bodies: Sequence[int], planned: Sequence[PlannedInverse], inverses: Sequence[PartitionedInverse],
+        planes: int, steps: Sequence[int],
+    ) -> None:  # fmt: skip
+        """Writes factors into the host rows of bodies; each is in use once its row is uploaded."""
+        rows, chosen = self.bodies, list(bodies)
+        for body, made in zip(bodies, planned, strict=True):
+            if self._plan_in_row.get(body) is not made.plan:
+                self._use_plan(body, made.plan, planes)
+        rows["matrix"][chosen] = [each.matrix for each in inverses]
+        rows["scale"][chosen] = [each.scale for each in inverses]
+        rows["factor_step"][chosen], rows["helper"][chosen] = steps, 0
+        if self._helper:
+            for body, made, inverse in zip(bodies, planned, inverses, strict=True):
+                if inverse.far:
+                    self._use_far(body, made, inverse.far)
+
+    def _use_plan(self, body: int, device_plan: DevicePlan, planes: int) -> None:
+        """Has a body use factors of another plan."""
+        row = self.bodies[body]
+        self._plan_in_row[body] = device_plan
+        row["plan"], row["planes"] = device_plan.address, planes
+        self.reserve_vectors(body, device_plan)
+        for name, address in self._addresses(body, device_plan).items():
+            row[name] = address
+        self._factor_bytes[body] = device_plan.bytes
+
+    def _use_far(self, body: int, planned: PlannedInverse, far: FarInverse) -> None:
+        """Has a second GPU use its part of an inverse."""
+        assert self._helper is not None and planned.far is not None
+        row = self.bodies[body]
+        row["helper"] = self._helper.use(row, far, planned.far, self._far_vectors[body, planned.plan.address])
 
     def _addresses(self, body: int, plan: DevicePlan) -> dict[str, int]:
         """Returns the addresses of the vectors of a body, by name."""

@@ -8,18 +8,17 @@ import tempfile
 import threading
 import time
 from collections import Counter
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from sim_server.recording import messages
-from sim_server.service.service import ROUND_PERIOD
-from sim_server.simulation import Simulation
 from tests.bench.gpu.problem import Problem
-from tests.bench.gpu.served import Served
 
 Row = dict[str, Any]
+ROUND_PERIOD = 1e-3  # s, as in servers of all commits
 PATIENCE = 120.0  # s for the first factor
 LEAST = 1.0  # us a factor of a thread that is named
 KEPT = ["body", "step", "factor_step", "iterations", "whole"]  # of records; all of them would fill memory
@@ -42,52 +41,60 @@ def thread_seconds() -> dict[str, float]:
 def measure(
     beams: int, tets: int, device: str, worker: str, first: float, seconds: float, schedule: str = "excess"
 ) -> Row:  # fmt: skip
-    """Measures for `seconds`, from when all beams use their second factor: some of the first ones are old, as they
-    waited for the others. Begins `first` seconds at most after a first factor came, for which a worker on a GPU may
-    compile its kernels, as the server does those that build inverses."""
+    """Measures (`watched`) beams that are put back to their start every 100 steps."""
+    from sim_server.recording import messages
+    from sim_server.simulation import Simulation
+    from tests.bench.gpu.served import Served
+
     with tempfile.TemporaryDirectory() as folder:
         scene = Problem(tets, beams=beams).write(Path(folder))
         sim = Simulation.load(scene, [f"solver.schedule={schedule}"], device=device)
     with Served(sim, worker) as served:
-        driver, adopted, cpu = served.driver, [0], 0.0
         for body in sim.world.bodies[1:]:
             served.link.announce(messages.topology(sim, body))
-        driver.on_adopt.append(lambda factor: adopted.__setitem__(0, adopted[0] + 1))
-        begun, came = time.monotonic(), float("nan")
-        used, uses = np.full(beams, -1), np.zeros(beams, int)  # step of the factor in use, and how many were
-        ready = float("nan")
-        while uses.min() < 2 and time.monotonic() < (came + first if came == came else begun + PATIENCE):
-            r = driver.pump()
-            time.sleep(ROUND_PERIOD)
-            if adopted[0] and came != came:
-                came = time.monotonic()
-            for body, step in zip(*np.unique(np.stack([r["body"], r["factor_step"]]), axis=1), strict=True):
-                uses[body] += step > used[body]
-                used[body] = max(used[body], step)
-            if uses.min() and ready != ready:
-                ready = time.monotonic() - came
-        without = int((uses == 0).sum())
-        end, records, count, threads = time.monotonic() + seconds, [], adopted[0], thread_seconds()
-        while time.monotonic() < end:
-            busy = time.thread_time()
-            found = driver.pump()
-            cpu += time.thread_time() - busy
-            records.append({name: found[name].copy() for name in KEPT})
-            time.sleep(ROUND_PERIOD)
-        count = adopted[0] - count
-        spent = {
-            name: 1e6 * (lasted - threads.get(name, 0.0)) / max(count, 1) for name, lasted in thread_seconds().items()
-        }
-        r = {name: np.concatenate([each[name] for each in records]) for name in KEPT}
+        table = served.driver.table
+        row = watched(served.driver.pump, lambda: int(table.used.sum()), beams, first, seconds)
+    return {"beams": beams, "tets": tets, "worker": worker, "schedule": schedule, **row}
+
+
+def watched(
+    pump: Callable[[], NDArray[Any]], adopted: Callable[[], int], beams: int, first: float, seconds: float
+) -> Row:
+    """Measures for `seconds`, from when all beams use their second factor: some of the first ones are old, as they
+    waited for the others. Begins `first` seconds at most after a first factor came, for which a worker on a GPU may
+    compile its kernels, as the server does those that build inverses. pump: what the thread beside the loop does in
+    each round; returns records. adopted: returns how many factors the loop was given."""
+    begun, came, cpu = time.monotonic(), float("nan"), 0.0
+    used, uses = np.full(beams, -1), np.zeros(beams, int)  # step of the factor in use, and how many were
+    ready = float("nan")
+    while uses.min() < 2 and time.monotonic() < (came + first if came == came else begun + PATIENCE):
+        r = pump()
+        time.sleep(ROUND_PERIOD)
+        if adopted() and came != came:
+            came = time.monotonic()
+        for body, step in zip(*np.unique(np.stack([r["body"], r["factor_step"]]), axis=1), strict=True):
+            uses[body] += step > used[body]
+            used[body] = max(used[body], step)
+        if uses.min() and ready != ready:
+            ready = time.monotonic() - came
+    without = int((uses == 0).sum())
+    end, records, count, threads = time.monotonic() + seconds, [], adopted(), thread_seconds()
+    while time.monotonic() < end:
+        busy = time.thread_time()
+        found = pump()
+        cpu += time.thread_time() - busy
+        records.append({name: found[name].copy() for name in KEPT})
+        time.sleep(ROUND_PERIOD)
+    count = adopted() - count
+    spent = {name: 1e6 * (lasted - threads.get(name, 0.0)) / max(count, 1) for name, lasted in thread_seconds().items()}
+    r = {name: np.concatenate([each[name] for each in records]) for name in KEPT}
     own = {name: column[r["factor_step"] >= 0] for name, column in r.items()}
     age = own["step"] - 1 - own["factor_step"]
     taken_up = len(np.unique(np.stack([own["body"], own["factor_step"]]), axis=1).T) - len(np.unique(own["body"]))
-    steps = len(r["step"]) / beams
     return {
-        "beams": beams, "tets": tets, "worker": worker, "schedule": schedule, "first factor after s": came - begun,
-        "all use one after s": ready, "without": without,
+        "first factor after s": came - begun, "all use one after s": ready, "without": without,
         "factors/s": count / seconds, "used/s": taken_up / seconds,
-        "service us/factor": 1e6 * cpu / max(count, 1), "steps/s": steps / seconds,
+        "service us/factor": 1e6 * cpu / max(count, 1), "steps/s": len(r["step"]) / beams / seconds,
         "us p50": 1e6 * float(np.percentile(r["whole"], 50)), "us p99": 1e6 * float(np.percentile(r["whole"], 99)),
         "factor age": float(age.mean()) if len(age) else None,
         "age p99": float(np.percentile(age, 99)) if len(age) else None, "oldest": int(age.max()) if len(age) else None,

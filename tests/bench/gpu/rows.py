@@ -52,10 +52,10 @@ def search_row(beams: Beams, search: Search, found: Found) -> Row:
 def phases(beams: Beams) -> int | None:
     """Of an application of the factor that the first beam has on a GPU, a barrier each; None where there is none."""
     solver = getattr(beams.engine, "solver", None)
-    if solver is None or not hasattr(solver, "plan") or beams.analysis is None:
+    if solver is None or not hasattr(solver, "begin_plan") or beams.analysis is None:
         return None
     planes = solver.planes or 1  # what beams get where the server chooses
-    return int(solver.plan(0, beams.analysis.pattern, planes).plan.phases)
+    return int(solver.begin_plan(0, beams.analysis.pattern, planes).result().plan.plan.phases)
 
 
 def _stages(records: NDArray[Any]) -> Row:

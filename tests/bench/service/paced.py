@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from protocol.factor import Factor
+from protocol.factors_together import FactorsTogether
 from sim_server.backends.cpu.structs import RECORD
 from sim_server.backends.kinds import Kind
 from sim_server.service.service import ROUND_PERIOD
@@ -73,6 +74,10 @@ class PacedLoop:
         self._engine.post_factors(bodies, factors)
         self._factors[list(bodies)] = [factor.step for factor in factors]
         self.posted += len(bodies)
+
+    def post_together(self, bodies: Sequence[int], factors: FactorsTogether) -> None:
+        """Likewise."""
+        self.post_factors(bodies, factors)
 
     def records_and_reactions(self) -> tuple[NDArray[Any], NDArray[np.float64]]:
         """Records of the steps that are due."""

@@ -49,7 +49,7 @@ def _watched(client: Client, seconds: float, first: float) -> dict[str, Any]:
         time.sleep(max(0.0, start + seconds * (k + 1) / LOOKS - time.monotonic()))
         after = _status(client)
         host.append(1e6 * after.objects[0].last.cpu_seconds)
-        ages += [body.last.factor_age for body in after.objects]
+        ages += [body.factor_age for body in after.objects]
     lasted = time.monotonic() - start
     used = sum(body.factors_used for body in after.objects) - sum(body.factors_used for body in before.objects)
     aged = np.array([age for age in ages if age >= 0] or [np.nan])

@@ -197,9 +197,10 @@ class InverseBuilder:
             copy(at, space.staging.ctypes.data, size, kind, stream.ptr)
         space.copied, space.source = stream.record(), list(values)
         graph.launch(stream)
-        for each in storages:
-            if self._helper and each.far:
-                self._helper.copy(each.far, each.matrix, each.scale, stream)
+        if self._helper:
+            for each in storages:
+                if each.far:
+                    self._helper.copy(each.far, each.matrix, each.scale, stream)
         done = stream.record()
         return [PartitionedInverse(*at, done, s.far) for at, s in zip(targets, storages, strict=True)]
 

@@ -6,7 +6,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_server.backends.declarations import Declarations
 from sim_server.backends.gpu.cupy_types import DeviceArray
 from sim_server.backends.gpu.device import Gpu
 from sim_server.backends.gpu.inverse.halves import FarFlags
@@ -15,15 +14,14 @@ from sim_server.backends.gpu.structs import PCG
 
 ALIGNMENT = 32  # entries to which the vectors of a body are aligned; 256 bytes
 PADDING = 32  # entries behind the packed vectors, to which padding refers
-TILE_SUMS: int = Declarations("backends/gpu/inverse/partitioned_inverse.cuh").constant("TILE_SUMS")
-ROUND = 6  # constant cost of a product, in chunks
 
 DEVICE_PLAN = PCG.dtype("DevicePlan")
 
 
-def shared_bytes(plan: Plan) -> int:
-    """Returns the bytes of shared memory that a thread block needs: vector of a phase in two float16, sums of tiles."""
-    return 4 * plan.x_area + 64 * TILE_SUMS + 48
+def shared_bytes(plan: Plan, warps: int) -> int:
+    """Returns the bytes of shared memory that a thread block of so many warps needs: vector of a phase in two float16,
+    sums of tiles that warps share."""
+    return 4 * plan.x_area + 128 * warps + 48
 
 
 def regrouped_by_block(start: NDArray[Any], phases: int, blocks: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
@@ -72,7 +70,8 @@ def entry_index(plan: Plan, cut: NDArray[np.int32]) -> NDArray[np.int32]:
 
 
 def paired_tiles(tiles: NDArray[Any], start: NDArray[Any], planes: int) -> tuple[NDArray[np.int32], NDArray[np.int64]]:
-    """Joins tiles of 8 rows with the next 8 rows where they follow, (k, 8): chunk, x, chunks, out, rows, 0, 0, 0."""
+    """Joins tiles of 8 rows with the next 8 rows where they follow, (k, 8): chunk, x, chunks, out, rows, 0,
+    chunks of the tiles before it in its list, 0."""
     chunk, x, chunks, out = tiles.T.astype(np.int64)
     follows = np.zeros(len(tiles), bool)  # the one before, in the same list
     follows[1:] = (x[1:] == x[:-1]) & (out[1:] == out[:-1] + 8) & (chunk[1:] == chunk[:-1] + planes * chunks[:-1])
@@ -83,22 +82,10 @@ def paired_tiles(tiles: NDArray[Any], start: NDArray[Any], planes: int) -> tuple
     found[:, :4] = tiles
     found[:, 4] = 8 + 8 * np.append(second[1:], False)
     kept = np.concatenate([[0], np.cumsum(~second)])
-    return found[~second], kept[start]
-
-
-def warps_per_tile(tiles: NDArray[Any], start: NDArray[Any], warps: int) -> NDArray[np.int32]:
-    """Returns the number of warps that share each tile of a list, (lists,); one alone would leave warps idle."""
-    count = np.diff(start)
-    total = np.concatenate([[0], np.cumsum(tiles[:, 2].astype(np.int64))])
-    mean = (total[start[1:]] - total[start[:-1]]) / np.maximum(count, 1)
-    best, least = np.ones(len(count), np.int32), np.full(len(count), np.inf)
-    for parts in range(1, warps + 1):
-        rounds = -(-count * parts // warps)
-        cost = rounds * (np.ceil(mean / parts) + ROUND)
-        fits = (count * parts <= TILE_SUMS) & (16 * count <= 32 * warps) if parts > 1 else np.ones(len(count), bool)
-        better = fits & (cost < least)
-        best[better], least[better] = parts, cost[better]
-    return best
+    found, start = found[~second], kept[start]
+    total = np.concatenate([[0], np.cumsum(found[:, 2])])
+    found[:, 6] = total[:-1] - np.repeat(total[start[:-1]], np.diff(start))
+    return found, start
 
 
 def block_ranges(segment_start: NDArray[Any], tile_start: NDArray[Any], plan: Plan) -> NDArray[np.int64]:
@@ -110,44 +97,42 @@ def block_ranges(segment_start: NDArray[Any], tile_start: NDArray[Any], plan: Pl
 
 
 def phase_lists(
-    segment_start: NDArray[Any], tile_start: NDArray[Any], split: NDArray[Any], formed: NDArray[Any]
+    segment_start: NDArray[Any], tile_start: NDArray[Any], formed: NDArray[Any], plan: Plan
 ) -> NDArray[np.int64]:
-    """Returns the lists of each thread block, (blocks, 4 phases + 2): starts of the segments of each phase and of its
-    tiles, within the block; warps per tile; first segment that is not formed.
+    """Returns the lists of each thread block, (blocks, 3 phases + 2): starts of the segments of each phase and of its
+    tiles, within the block; first segment that is not formed.
 
     formed (segments,): True for segments that the block forms; they come first in a phase.
     """
-    blocks, phases = split.shape
+    blocks, phases = plan.blocks, plan.phases
     at = phases * np.arange(blocks)[:, None] + np.arange(phases + 1)
     own = [start[at] - start[at[:, :1]] for start in (segment_start, tile_start)]
     total = np.concatenate([[0], np.cumsum(formed)])[segment_start]
-    return np.hstack([*own, split, own[0][:, :-1] + np.diff(total[at], axis=1)])
+    return np.hstack([*own, own[0][:, :-1] + np.diff(total[at], axis=1)])
 
 
 class DevicePlan:
     """A plan on the device.
 
-    warps: of a thread block
     device: thread blocks before `first` are on device 0, the others on device 1, and this is the plan of one of these
         (halves.py); None: for a solver without another device
     address: of the struct DevicePlan (pcg_structs.cuh)
     bytes: of the matrices
     """
 
-    def __init__(self, gpu: Gpu, plan: Plan, warps: int, device: int | None = None, first: int = 0):
+    def __init__(self, gpu: Gpu, plan: Plan, device: int | None = None, first: int = 0):
         self.gpu, self.plan = gpu, plan
         self.bytes = int(plan.chunks) * 512
         segment_start, cut = warp_segments(plan)
         segment_start, segment_order = regrouped_by_block(segment_start, plan.phases, plan.blocks)
         tile_start, tile_order = regrouped_by_block(plan.tile_start, plan.phases, plan.blocks)
         tiles, tile_start = paired_tiles(plan.tiles[tile_order], tile_start, plan.planes)
-        split = warps_per_tile(tiles, tile_start, warps).reshape(plan.blocks, plan.phases)
         target = np.full(plan.contributions + PADDING, len(plan.slots), np.int32)
         target[plan.slots] = np.arange(len(plan.slots), dtype=np.int32)
         self._contributions = len(plan.slots) + PADDING
         arrays: dict[str, NDArray[Any]] = {
             "block_ranges": block_ranges(segment_start, tile_start, plan),
-            "lists": phase_lists(segment_start, tile_start, split, cut[segment_order, 0] == 0),
+            "lists": phase_lists(segment_start, tile_start, cut[segment_order, 0] == 0, plan),
             "segments": cut[segment_order], "index": entry_index(plan, cut[segment_order]), "tiles": tiles,
             "target": target, "place": plan.place,
         }  # fmt: skip

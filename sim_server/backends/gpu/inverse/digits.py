@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from protocol.factor import FactorPattern
-from protocol.shared_memory.located import Located, address
+from protocol.shared_memory.located import Located, addresses
 from protocol.validate import helping_threads
 from sim_server.arrays import Float64
 from sim_server.backends.compiler import native
@@ -44,7 +44,7 @@ def largest_responses(pattern: FactorPattern, values: Sequence[NDArray[np.floati
     Takes a few passes over L. From any thread, without Python's lock.
     """
     numbers = [_contiguous(each) for each in values]
-    each = np.array([address(one) for one in numbers], np.uintp)
+    each = addresses(numbers)
     found = np.empty(len(numbers))
     arrays = pattern.super_start, pattern.row_start, pattern.rows, pattern.value_start, each, found
     threads = 1 + min(helping_threads(), len(numbers) // FEW)

@@ -1,9 +1,14 @@
 // SPDX-License-Identifier: MIT
 // z = P^-1 r by a partitioned inverse (plan.py): 2 P - 1 phases of dense products in float16 with float32 sums.
 //
-// A product of 16 rows x 32 columns is two matrix instructions. Their right factor is the vector, split into two columns of
-// float16 (value = high + low / 2048), which keep 22 bits of it, nearly those of float32. A warp needs five instructions for
-// 1024 bytes of matrix, so memory is the limit.
+// A product of 16 rows x 32 columns is two matrix instructions, of 8 rows each. The 16 bytes of a chunk that a lane loads are the left
+// factor of one as they are: their columns 0, 1 and 4, 5 its row, columns 2, 3 and 6, 7 its row eight further down. So of the right
+// factor, which is the vector, four columns are used: its halves for the former and for the latter, as two numbers of float16
+// (value = high + low / 2048), which keep 22 bits of it, nearly those of float32. A warp needs five instructions for 1024 bytes of
+// matrix, so memory is the limit. The warps of a thread block have equal shares of the chunks of a phase, wherever in a tile they begin
+// and end.
+//
+// With -DALONE, where little is left between phases, warps have whole tiles, and products are of 16 rows: two columns are used.
 #pragma once
 #include "block_group.cuh"
 #ifdef HELPED
@@ -11,16 +16,14 @@
 #endif
 
 #define LOW 2048.0f
-#ifndef CHUNKS_AT_ONCE
-#define CHUNKS_AT_ONCE 4
-#endif
-constexpr int TILE_SUMS = 64;  // most partial products of shared tiles in a phase
-constexpr int PADDING = 32;    // entries behind vectors, to which padding refers
+constexpr int PADDING = 32;  // entries behind vectors, to which padding refers
 #define LISTS 32768   // most bytes of a list that is copied to shared memory
 #ifdef ALONE          // words are at hand: few registers matter more
+#define CHUNKS_AT_ONCE 4
 #define FEW 2         // segments that a warp loads at a time, for short lists
 #define MANY 4
 #else
+#define CHUNKS_AT_ONCE 6
 #define FEW 3
 #define MANY 8        // 2304 entries in one trip through L2 with 8 warps
 #endif
@@ -61,17 +64,16 @@ __device__ __forceinline__ void put_halves(const SplitVector& to, int i, float v
     to.low[i] = half_of((v - of_half(high)) * LOW);
 }
 
-__device__ __forceinline__ unsigned shared_address(const void* p) { return (unsigned)__cvta_generic_to_shared(p); }
-
-// Loads 16 bytes of shared memory if `wanted`, else zeros, without a branch.
-__device__ __forceinline__ uint4 shared_load(unsigned from, bool wanted) {
-    uint4 v;
-    asm volatile(
-        "{.reg .pred p; setp.ne.s32 p, %5, 0; mov.b32 %0, 0; mov.b32 %1, 0; mov.b32 %2, 0; mov.b32 %3, 0;\n"
-        "@p ld.shared.v4.u32 {%0, %1, %2, %3}, [%4];}"
-        : "=r"(v.x), "=r"(v.y), "=r"(v.z), "=r"(v.w) : "r"(from), "r"((int)wanted));
-    return v;
+// Place of entry `lane` of a segment in the vector.
+__device__ __forceinline__ int entry_place(int lane) {
+#ifdef ALONE
+    return lane;
+#else
+    return (lane & ~6) | (lane & 2) << 1 | (lane & 4) >> 1;  // of each eight: 0, 1, 4, 5, 2, 3, 6, 7
+#endif
 }
+
+__device__ __forceinline__ unsigned shared_address(const void* p) { return (unsigned)__cvta_generic_to_shared(p); }
 
 __device__ __forceinline__ uint4 shared_vector_load(unsigned from) {
     uint4 v;
@@ -79,7 +81,17 @@ __device__ __forceinline__ uint4 shared_vector_load(unsigned from) {
     return v;
 }
 
-// sum += a b: a of 16 rows x 16 columns, b of 16 x 8, of which two columns are used.
+// Loads 8 bytes of shared memory if `wanted`, else zeros, without a branch.
+__device__ __forceinline__ uint2 shared_pair_load(unsigned from, bool wanted) {
+    uint2 v;
+    asm volatile(
+        "{.reg .pred p; setp.ne.s32 p, %3, 0; mov.b32 %0, 0; mov.b32 %1, 0;\n"
+        "@p ld.shared.v2.u32 {%0, %1}, [%2];}"
+        : "=r"(v.x), "=r"(v.y) : "r"(from), "r"((int)wanted));
+    return v;
+}
+
+// sum += a b: a of 16 rows x 16 columns, b of 16 x 8, of which two or four columns are used.
 __device__ __forceinline__ void multiply_add(float sum[4], unsigned a0, unsigned a1, unsigned a2, unsigned a3, unsigned b0, unsigned b1) {
 #if __CUDA_ARCH__ >= 800
     asm("mma.sync.aligned.m16n8k16.row.col.f32.f16.f16.f32 {%0, %1, %2, %3}, {%4, %5, %6, %7}, {%8, %9}, {%0, %1, %2, %3};"
@@ -103,9 +115,9 @@ struct PartitionedInverse {
     const float* scale;
     FlagWord<float> *residual, *product, *z, *formed, *solved, *contributed;
     SplitVector vector;
-    float* tile_sums;        // (TILE_SUMS, 16)
-    const int* lists;        // of the phases: first segment (phases + 1), first tile (phases + 1), warps that share a tile,
-                             // first segment that is not formed here
+    float* tile_sums;        // (WARPS, 2, 16) of the tile that a warp ends, and of the one that it begins, where others have the rest
+    const int* lists;        // of the phases: first segment (phases + 1), first tile (phases + 1), first segment that is
+                             // not formed here
     const WarpSegment* segments;
     const int* where;        // (segments, 32) DevicePlan.index
     const Tile* tiles;
@@ -158,10 +170,10 @@ struct PartitionedInverse {
         vector.high = arena.take<unsigned short>(shared_plan->entries);
         vector.low = arena.take<unsigned short>(shared_plan->entries);
 #ifndef ALONE
-        tile_sums = arena.take<float>(16 * TILE_SUMS);
+        tile_sums = arena.take<float>(16 * 2 * WARPS);
 #endif
         const BlockRanges part = plan->block_ranges[index];
-        lists = brought(plan->lists + index * (4 * phases + 2), 4 * phases + 2, arena);
+        lists = brought(plan->lists + index * (3 * phases + 2), 3 * phases + 2, arena);
         tiles = brought(plan->tiles + part.tile, part.tiles, arena);
     }
 
@@ -205,7 +217,7 @@ struct PartitionedInverse {
     // loads, so that their latencies overlap.
     __device__ __forceinline__ void gather(int phase, const ResidualSource& from, unsigned number, float unit) const {
         const int warp = threadIdx.x / 32, first = lists[phase], last = lists[phase + 1];
-        const int middle = phase < groups ? lists[3 * phases + 2 + phase] : first, formed_here = middle - first;
+        const int middle = phase < groups ? lists[2 * phases + 2 + phase] : first, formed_here = middle - first;
         if (phase == 0) {
             if (formed_here <= FEW * WARPS) residual_segments<FEW>(first + warp, middle, from, number, unit);
             else for (int k = first + warp; k < middle; k += MANY * WARPS) residual_segments<MANY>(k, middle, from, number, unit);
@@ -258,7 +270,7 @@ struct PartitionedInverse {
 
     __device__ __forceinline__ void put(const WarpSegment& segment, float v, unsigned number, float unit) const {
         const int lane = threadIdx.x % 32;
-        put_halves(vector, segment.to + lane, unit * v);
+        put_halves(vector, segment.to + entry_place(lane), unit * v);
         if (segment.keep & 1) put_for_all(formed[segment.from + lane], v, number, segment.kind != 0);
     }
 
@@ -341,7 +353,7 @@ struct PartitionedInverse {
         } while (keep_polling(!all, spins));
 #pragma unroll
         for (int k = 0; k < N; ++k)
-            if (at + k * WARPS < last) put_halves(vector, segments[at + k * WARPS].to + lane, unit * v[k]);
+            if (at + k * WARPS < last) put_halves(vector, segments[at + k * WARPS].to + entry_place(lane), unit * v[k]);
     }
 
 #ifdef ALONE
@@ -483,33 +495,74 @@ struct PartitionedInverse {
         return zr;
     }
 #else
+    // Address of what this lane has of the vector's first 32 entries from x on.
+    __device__ __forceinline__ unsigned vector_address(int x) const {
+        const int lane = threadIdx.x % 32;
+        return shared_address((lane & 4 ? vector.low : vector.high) + x + 8 * (lane % 4) + (lane & 8 ? 4 : 0));
+    }
+
+    // Row `lane` (of sixteen) of what a warp has summed up, in lanes 0 to 15.
+    static __device__ __forceinline__ float row_of(const float sum[2][4]) {
+        const int lane = threadIdx.x % 32;  // lanes 4 r, 4 r + 1 have halves of row r, the two behind them of row r + 8
+        const bool lower = lane & 2;
+        const float first = (lower ? sum[1][0] : sum[0][0]) + (lower ? sum[1][1] : sum[0][1]) / LOW;
+        const float second = (lower ? sum[1][2] : sum[0][2]) + (lower ? sum[1][3] : sum[0][3]) / LOW;
+        float part = lane & 1 ? second : first;
+        part += __shfl_xor_sync(ALL, part, 1);
+        return __shfl_sync(ALL, part, 4 * (lane % 8) + (lane & 8 ? 2 : 0));
+    }
+
+    // Chunks of all tiles of a phase, side by side; which of them a warp has: [share(w, total), share(w + 1, total)).
+    __device__ __forceinline__ int chunks_of(int first, int count) const {
+        return count > 0 ? tiles[first + count - 1].before + tiles[first + count - 1].chunks : 0;
+    }
+    static __device__ __forceinline__ int share(int warp, int total) { return total * warp / WARPS; }
+
+    // The tile in which chunk `at` of a phase lies.
+    __device__ __forceinline__ int tile_at(int first, int count, int at) const {
+        int found = first - 1;
+        for (int k = threadIdx.x % 32; k - (int)threadIdx.x % 32 < count; k += 32)
+            found += __popc(__ballot_sync(ALL, k < count && tiles[first + min(k, count - 1)].before <= at));
+        return found;
+    }
+
+    // Sum of the pieces of a tile that this warp began and later warps end, at chunk `end` of the phase.
+    __device__ __forceinline__ float joined(int warp, int total, int end) const {
+        const int lane = threadIdx.x % 32;
+        float value = tile_sums[16 * (2 * warp + 1) + lane];
+        for (int w = warp + 1; w < WARPS && share(w, total) < end; ++w)
+            if (share(w + 1, total) > share(w, total)) value += tile_sums[16 * 2 * w + lane];
+        return value;
+    }
+
     // Sums over chunks [from, to) of this block's storage, and over those `second` further on, of the next eight rows; the
     // vector begins at `x`.
     template <bool NEAR>
     __device__ __forceinline__ void accumulate(int from, int to, int second, int x, float sum[2][4]) const {
         const int lane = threadIdx.x % 32;
-        const unsigned half = shared_address((lane & 4 ? vector.low : vector.high) + x + 8 * (lane % 4)), a = shared_address(kept + lane);
+        const unsigned half = vector_address(x), a = shared_address(kept + lane);
         const uint4* far = matrix + lane;
         for (int at = from; at < to; at += CHUNKS_AT_ONCE) {
-            uint4 m[CHUNKS_AT_ONCE], n[CHUNKS_AT_ONCE], v[CHUNKS_AT_ONCE];
+            uint4 m[CHUNKS_AT_ONCE], n[CHUNKS_AT_ONCE];
+            uint2 v[CHUNKS_AT_ONCE];
 #pragma unroll
             for (int k = 0; k < CHUNKS_AT_ONCE; ++k) {
                 const int c = min(at + k, to - 1);
-                m[k] = NEAR ? shared_load(a + 512 * c, true) : __ldg(far + 32ll * c);
-                n[k] = NEAR ? shared_load(a + 512 * (c + second), second > 0) : second ? __ldg(far + 32ll * (c + second)) : make_uint4(0, 0, 0, 0);
-                v[k] = shared_load(half + 64 * (c - from), lane < 8 && at + k < to);
+                m[k] = NEAR ? shared_vector_load(a + 512 * c) : __ldg(far + 32ll * c);
+                n[k] = NEAR ? shared_vector_load(a + 512 * (c + second)) : __ldg(far + 32ll * (c + second));
+                v[k] = shared_pair_load(half + 64 * (c - from), at + k < to);
             }
 #pragma unroll
             for (int k = 0; k < CHUNKS_AT_ONCE; ++k) {
-                multiply_add(sum[0], m[k].x, n[k].x, m[k].y, n[k].y, v[k].x, v[k].y);
-                multiply_add(sum[1], m[k].z, n[k].z, m[k].w, n[k].w, v[k].z, v[k].w);
+                multiply_add(sum[0], m[k].x, m[k].y, m[k].z, m[k].w, v[k].x, v[k].y);
+                multiply_add(sum[1], n[k].x, n[k].y, n[k].z, n[k].w, v[k].x, v[k].y);
             }
         }
     }
 
     // Row `lane` (of sixteen) of a tile's product over its chunks [low, high), in lanes 0 to 15.
     __device__ __forceinline__ float product_of(const Tile& tile, int low, int high) const {
-        const int lane = threadIdx.x % 32, second = tile.rows > 8 ? tile.chunks * planes : 0, x = tile.x;
+        const int second = tile.rows > 8 ? tile.chunks * planes : 0, x = tile.x;
         float total = 0, weight = 1;
         for (int plane = 0; plane < planes; ++plane, weight /= LOW) {
             float sum[2][4] = {};
@@ -517,19 +570,16 @@ struct PartitionedInverse {
             const int kept_to = near - second, middle = to < kept_to ? to : from > kept_to ? from : kept_to;
             accumulate<true>(from, middle, second, x + 32 * low, sum);
             accumulate<false>(middle, to, second, x + 32 * (low + middle - from), sum);
-            const float upper = sum[0][0] + sum[1][0] + (sum[0][1] + sum[1][1]) / LOW;  // lane 4 r: row r
-            const float lower = sum[0][2] + sum[1][2] + (sum[0][3] + sum[1][3]) / LOW;  // and row r + 8
-            const float one = __shfl_sync(ALL, upper, 4 * (lane % 8)), two = __shfl_sync(ALL, lower, 4 * (lane % 8));
-            total += weight * (lane & 8 ? two : one);
+            total += weight * row_of(sum);
         }
         return total;
     }
 
-    // Computes the products of a phase; returns this thread's part of z . r. unit: factor by which the vector is scaled.
+    // Computes the products of a phase; returns this thread's part of z . r. The vector has been read by all threads. unit: factor by
+    // which it is scaled.
     __device__ __forceinline__ double multiply(int phase, const ResidualSource& from, unsigned number, float unit) const {
         const int lane = threadIdx.x % 32, warp = threadIdx.x / 32;
         const int first = lists[phases + 1 + phase], count = lists[phases + 2 + phase] - first;
-        const int parts = lists[2 * phases + 2 + phase];
         const bool forward = phase < groups - 1;
         const float back = 1 / unit;
         double zr = 0;
@@ -564,30 +614,24 @@ struct PartitionedInverse {
                 for (unsigned spins = 0; keep_polling(!q.unpack(qi, from.q_number), spins);) q = product[i].load();
             zr += (double)value * (ri - from.alpha * qi);
         };
-        const int row = threadIdx.x;
-        bool here = row < 16 * count;
-        if (parts > 1 && here) {
-            here = row % 16 < tiles[first + row / 16].rows;
-            if (here) look_up(tiles[first + row / 16], row % 16);
-        }
-        for (int job = warp; job < count * parts; job += WARPS) {
+        const int total = chunks_of(first, count), low = share(warp, total), high = share(warp + 1, total);
+        int open = 0;  // end of a tile that this warp begins and others end
+        for (int next = low, at = tile_at(first, count, low); next < high; ++at) {
             __syncwarp();  // some lanes may still be in `finish`
-            const int at = parts > 1 ? job / parts : job, part = job - at * parts;
-            const Tile tile = tiles[first + at];
-            if (parts == 1 && lane < tile.rows) look_up(tile, lane);
-            const float value = product_of(tile, tile.chunks * part / parts, tile.chunks * (part + 1) / parts);
+            const Tile tile = tiles[at];
+            const int begins = next - tile.before, end = tile.before + tile.chunks;
+            const int ends = min(tile.chunks, high - tile.before);
+            const bool opens = begins == 0, whole = opens && ends == tile.chunks;
+            if (opens && lane < tile.rows) look_up(tile, lane);
+            const float value = product_of(tile, begins, ends);
+            next = tile.before + ends;
             if (lane >= tile.rows) continue;
-            if (parts > 1) tile_sums[16 * job + lane] = value;
-            else finish(back * value);
+            if (whole) finish(back * value);
+            else tile_sums[16 * (2 * warp + opens) + lane] = value;
+            if (opens && !whole) open = end;
         }
-        if (parts > 1) {
-            __syncthreads();
-            if (here) {
-                float value = 0;
-                for (int k = 0; k < parts; ++k) value += tile_sums[16 * (row / 16 * parts + k) + row % 16];
-                finish(back * value);
-            }
-        }
+        __syncthreads();  // the vector has been read, too
+        if (open > 0) finish(back * joined(warp, total, open));
         return zr;
     }
 #endif

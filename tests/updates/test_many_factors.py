@@ -1,0 +1,286 @@
+# SPDX-License-Identifier: MIT
+"""Factors of one message: checked and used together, each as if it had come alone."""
+
+from collections.abc import Callable
+from concurrent.futures import wait
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from protocol.factor import Factor
+from protocol.factors_together import FactorsTogether
+from sim_server.simulation import Simulation
+from sim_server.updates.driver import Driver
+from sim_server.updates.factor_source import FactorSource, Job
+from sim_server.updates.many_factors import MANY
+from sim_server.updates.update_table import NONE
+from tests.scenes import bar, simulation
+
+BODIES = MANY + 3
+
+
+class Messages(FactorSource):
+    """A source whose factors the test gives, alone or together. It takes no jobs."""
+
+    def __init__(self) -> None:
+        self.alone: list[Factor] = []
+        self.together: list[FactorsTogether] = []
+        self.over: set[str] = set()  # objects that were split since
+        self.blamed: list[str] = []
+        self.begin_check: Callable[..., Any] = lambda jobs: None
+
+    def ready(self) -> int:
+        return 0
+
+    def submit(self, job: Job) -> bool:
+        return False
+
+    def poll(self) -> list[Factor]:
+        found, self.alone = self.alone, []
+        return found
+
+    def poll_together(self) -> list[FactorsTogether]:
+        found, self.together = self.together, []
+        return found
+
+    def failures(self) -> list[tuple[str, str]]:
+        return []
+
+    def epoch(self, name: str) -> int | None:
+        return 2 if name in self.over else 1
+
+    def check_with(self, begin: Callable[..., Any]) -> None:
+        self.begin_check = begin
+
+    def factor_failed(self, worker: str, object: str, pattern: int | None = None) -> None:
+        self.blamed.append(object)
+
+
+def falling() -> Simulation:
+    bars = [bar((2, 1, 1), young=1e6 * (1 + 0.1 * k), fixed="X < 0.01", name=f"bar{k}") for k in range(BODIES)]
+    return simulation(*bars, gravity=(0, -9.81, 0), preconditioner="cholesky", update="async")
+
+
+def start() -> tuple[Driver, Messages]:
+    """A driver at step 3, of all of whose bodies a job is in flight."""
+    sim = falling()
+    driver = Driver(sim, source := Messages())
+    sim.engine.run(3)
+    for state in driver.bodies:
+        in_flight(driver, state.body.index)
+    return driver, source
+
+
+def in_flight(driver: Driver, body: int) -> None:
+    """As if the matrix of this step had been sent."""
+    state, step, b = driver.bodies[body], driver.engine.step, driver.simulation.world.bodies[body]
+    driver.engine.assemble()
+    values = np.array(driver.simulation.system.body_values(b.first, b.last))
+    driver.engine.solve()
+    state.on_job(step, driver._method)
+    state.job.set_copy(values)
+    state.on_sent(step)
+
+
+def made(driver: Driver) -> FactorsTogether:
+    """Factors of the matrices in flight, of one message."""
+    found = []
+    for state in driver.bodies:
+        step, values = state.job.matrix
+        driver.inline.submit(Job(state.body.name, 1, step, True, values, "float32"))
+        found += driver.inline.poll()
+    first = found[0].pattern
+    assert all(each.pattern.id == first.id for each in found)
+    return FactorsTogether(
+        first, "w", "cholesky", [f.object for f in found], [1] * BODIES, [f.step for f in found], [True] * BODIES,
+        [f.values for f in found], [1e-4 * (k + 1) for k in range(BODIES)], [""] * BODIES,
+    )  # fmt: skip
+
+
+def checked(driver: Driver) -> None:
+    """Takes up what has come until nothing is checked any more."""
+    driver.receive(driver.source, driver.policy.on_factors)
+    while driver.checks:
+        wait([each.reasons for each in driver.checks])
+        driver.receive(driver.source, driver.policy.on_factors)
+
+
+def checked_as_they_come(source: Messages, factors: FactorsTogether) -> FactorsTogether:
+    """As the thread that copies them does."""
+    check = source.begin_check(list(zip(factors.objects, factors.steps, strict=True)))
+    return replace(factors, reasons=check(factors))
+
+
+def told(driver: Driver) -> list[tuple[Any, ...]]:
+    """What is known of each body."""
+    return [
+        (t.factors.newest, t.factors.used, t.factors.regularized, t.factors.cost.value, t.factors.workers,
+         t.job.in_flight, t.job.checked, t.job.sent, t.job.matrix is None, t.failures.in_a_row, t.failures.refused,
+         t.failures.reason)
+        for t in driver.bodies
+    ]  # fmt: skip
+
+
+def spoilt(factors: FactorsTogether, places: list[int]) -> FactorsTogether:
+    """Some of them are nan; another one is of a matrix that had to be changed."""
+    values = [np.full_like(v, np.nan) if k in places else v for k, v in enumerate(factors.values)]
+    return replace(factors, values=values, remedies=["shifted" if k == 1 else "" for k in range(BODIES)])
+
+
+@pytest.mark.parametrize("early", [False, True], ids=["checked beside", "checked as they come"])
+@pytest.mark.parametrize("bad", [[], [0], [2, 5, BODIES - 1], list(range(BODIES))], ids=str)
+def test_together_they_are_used_or_refused_as_if_each_came_alone(bad, early):
+    (one, alone), (many, together) = start(), start()
+    alone.alone = list(spoilt(made(one), bad))
+    factors = spoilt(made(many), bad)
+    together.together = [checked_as_they_come(together, factors) if early else factors]
+    checked(one), checked(many)
+    assert told(one) == told(many) and alone.blamed == together.blamed == [f"bar{k}" for k in bad]
+    steps = [one.engine.run(1) and one.engine.records()["factor_step"].tolist()[-BODIES:] for _ in range(2)]
+    assert steps == [many.engine.run(1) and many.engine.records()["factor_step"].tolist()[-BODIES:] for _ in range(2)]
+    assert steps[-1] == [-1 if k in bad else many.bodies[k].factors.newest for k in range(BODIES)]
+    np.testing.assert_array_equal(one.simulation.world.x, many.simulation.world.x)
+
+
+def test_they_are_checked_together_and_the_next_matrices_may_leave_meanwhile():
+    driver, source = start()
+    source.together = [factors := made(driver)]
+    driver.receive(source, driver.policy.on_factors)
+    (check,) = driver.checks
+    assert check.factors is factors
+    assert not driver.table.in_flight.any() and (driver.table.checked == driver.table.sent).all()
+    checked(driver)
+    assert (driver.table.checked == NONE).all() and (driver.table.used == 1).all()
+
+
+def test_those_that_wait_for_a_check_and_those_of_bodies_that_move_no_more_are_taken_one_by_one():
+    driver, source = start()
+    first = made(driver)
+    source.together = [first]
+    driver.receive(source, driver.policy.on_factors)
+    driver.bodies[1].frozen = True
+    checked(driver)
+    for body in range(BODIES):
+        in_flight(driver, body)
+    second = made(driver)
+    driver.table.checked[0] = 7  # as if one of step 7 were checked
+    driver.bodies[2].factors.newest = second.steps[2] + 1
+    source.together = [second]
+    driver.receive(source, driver.policy.on_factors)
+    (check,) = driver.checks
+    assert list(check.factors.objects) == [f"bar{k}" for k in range(3, BODIES)]
+    wait([check.reasons])
+    driver.table.checked[0] = NONE
+    checked(driver)
+    assert [t.factors.newest for t in driver.bodies[:4]] == [*second.steps[:2], second.steps[2] + 1, second.steps[3]]
+    assert [t.factors.used for t in driver.bodies[:4]] == [2, 2, 1, 2]
+
+
+def test_those_that_were_checked_as_they_came_are_used_at_once_however_few():
+    driver, source = start()
+    memory = driver.bodies[0].job.matrix[1]
+    source.together = [checked_as_they_come(source, made(driver).of([0, 3]))]
+    driver.receive(source, driver.policy.on_factors)
+    assert not driver.checks and driver.table.used[:4].tolist() == [1, 0, 0, 1]
+    assert driver.bodies[0].job.matrix is None and any(memory is each for each in driver.snapshots.free[memory.shape])
+
+
+def test_a_verdict_on_a_matrix_that_is_not_there_any_more_counts_for_nothing(monkeypatch):
+    """Its memory may have been written to while it was checked: each of them is checked again, without it."""
+    driver, source = start()
+    factors = checked_as_they_come(source, made(driver))
+    factors.reasons[4] = "spoilt meanwhile"
+    driver.snapshots.release(driver.bodies[4])
+    seen, check = [], driver.check.reject_reasons
+    monkeypatch.setattr(driver.check, "reject_reasons", lambda given, *more: seen.append(given) or check(given, *more))
+    source.together = [factors]
+    checked(driver)
+    assert (driver.table.used == 1).all() and source.blamed == []
+    assert [(factor.object, matrix) for given in seen for factor, matrix in given] == [("bar4", None)]
+
+
+@pytest.mark.parametrize("sent", [None, "another step", "positions"])
+def test_without_the_matrix_of_each_they_are_checked_later(sent):
+    driver, source = start()
+    step, values = driver.bodies[2].job.matrix
+    wrong = {None: None, "another step": (step + 1, values), "positions": (step, np.zeros((4, 3)))}
+    driver.bodies[2].job.matrix = wrong[sent]
+    jobs = [(state.body.name, state.job.sent) for state in driver.bodies]
+    assert source.begin_check(jobs) is None and source.begin_check(jobs[:2]) is not None
+    assert source.begin_check([("nobody", step)]) is None
+
+
+def test_few_are_taken_one_by_one():
+    driver, source = start()
+    source.together = [made(driver).of(range(MANY - 1))]
+    driver.receive(source, driver.policy.on_factors)
+    assert not driver.checks and driver.table.used.tolist() == [1] * (MANY - 1) + [0] * (BODIES - MANY + 1)
+
+
+def test_a_factor_of_a_mesh_that_was_split_meanwhile_costs_the_others_nothing():
+    driver, source = start()
+    source.together = [made(driver)]
+    driver.receive(source, driver.policy.on_factors)
+    source.over = {"bar4"}
+    checked(driver)
+    assert [t.factors.used for t in driver.bodies] == [int(k != 4) for k in range(BODIES)]
+    assert "split since" in driver.bodies[4].failures.reason and source.blamed == []
+
+
+def test_a_check_that_fails_by_itself_refuses_all_of_them_and_blames_nobody(monkeypatch):
+    driver, source = start()
+    monkeypatch.setattr(driver.check, "reject_together", lambda *_: {}["nose"])
+    source.together = [made(driver)]
+    checked(driver)
+    assert (driver.table.used == 0).all() and source.blamed == []
+    assert driver.counters.refusals == {"unexpected": 1}
+    assert all("its check failed: KeyError" in t.failures.reason for t in driver.bodies)
+
+
+def test_of_one_that_is_older_than_that_which_came_meanwhile_nothing_is_left():
+    driver, source = start()
+    source.together = [factors := made(driver)]
+    driver.receive(source, driver.policy.on_factors)
+    driver.bodies[3].factors.newest = factors.steps[3] + 1
+    checked(driver)
+    assert [t.factors.used for t in driver.bodies] == [int(k != 3) for k in range(BODIES)]
+    driver.engine.run(1)
+    assert driver.engine.records()["factor_step"].tolist()[-BODIES:][2:5] == [factors.steps[2], -1, factors.steps[4]]
+
+
+def test_each_of_them_is_judged_as_if_it_came_alone():
+    """To the bit; also those that are not of the size of their object."""
+    driver, _ = start()
+    factors = spoilt(made(driver), [1, 6])
+    matrices = [state.job.matrix[1] for state in driver.bodies]
+    matrices[2] = None
+    check = driver.check
+    alone = [check.reject_reasons([each])[0] for each in zip(factors, matrices, strict=True)]
+    assert check.reject_together(factors, matrices) == alone and [bool(a) for a in alone].count(True) == 2
+    check._patterns._given["bar3"] = driver.simulation.system.body_pattern(0, 4)
+    told = check.reject_together(factors, matrices)
+    assert told[3].startswith("its size is") and told[:3] + told[4:] == alone[:3] + alone[4:]
+
+
+def test_observers_are_told_of_each():
+    driver, source = start()
+    seen: list[Factor] = []
+    driver.on_adopt.append(seen.append)
+    source.together = [factors := spoilt(made(driver), [2])]
+    checked(driver)
+    assert [each.object for each in seen] == [name for name in factors.objects if name != "bar2"]
+    assert all(each.method == "cholesky" and each.worker == "w" for each in seen)
+    assert [each.seconds for each in seen[:2]] == factors.seconds[:2] and seen[1].remedy == "shifted"
+
+
+def test_columns_are_a_sequence_of_factors():
+    driver, _ = start()
+    factors = made(driver)
+    assert len(factors) == BODIES and [f.object for f in factors] == factors.objects
+    assert isinstance(factors[2], Factor) and factors[2].values is factors.values[2]
+    assert factors[1:3].objects == factors.objects[1:3] == factors.of([1, 2]).objects
+    assert factors[-1].seconds == factors.seconds[-1]
+    with pytest.raises(IndexError):
+        factors[BODIES]
