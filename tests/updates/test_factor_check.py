@@ -13,8 +13,8 @@ from precond_worker.factorization.registry import make_factorization
 from protocol.factor import Factor
 from protocol.method import Method
 from sim_server.simulation import Simulation
-from sim_server.updates.driver import Driver
 from sim_server.updates import factor_check
+from sim_server.updates.driver import Driver
 from sim_server.updates.factor_check import FactorCheck
 from sim_server.updates.factor_source import Inline, Job
 from tests.scenes import bar, simulation
