@@ -17,7 +17,7 @@ from sim_server.simulation import Simulation
 from tests.contact.kernels_beside import TEXT, Beside, compiled
 from tests.contact.scenes import D, block, floor, over
 from tests.contact.test_contact_edges import crossed
-from tests.contact.test_contact_held_apart import thrown
+from tests.contact.test_contact_held_apart import crushed, thrown
 from tests.contact.test_contact_triangles import SMALL, obstacle
 
 ISLANDS = """
@@ -356,6 +356,22 @@ def test_nodes_that_are_set_back_are_told_of_their_own_body(library, monkeypatch
     assert beside.tally["islands"] == 1 and records["passes"].all()
     assert records["clipped"][0] > 0 and records["clipped"][1] == 0
     assert records["status"].tolist() == [STATUS["CONTACT"], STATUS["CONVERGED"]]
+
+
+def test_obstacles_hold_back_what_was_held_apart(library, monkeypatch):
+    """In this order, as on the CPU: what is held apart is not taken into the floor by that."""
+    sim = crushed(solver=TIGHT, passes=30, stiffness=1e-6)
+    beside, apart = IslandsBeside(library, sim, monkeypatch), 0
+    for _ in range(2):
+        slot = int(beside.counter[0]) % 4
+        ours, theirs = beside.step()
+        beside.counter += 1
+        assert np.abs(ours - theirs).max() <= 1e-6 * np.abs(theirs).max()
+        told = beside.told[slot]["clipped"]
+        assert told.tolist() == sim.engine.records()["clipped"].tolist()
+        assert sim.world.x[:, 1].min() > 0
+        apart += beside.tally["holds"]
+    assert apart > 0
 
 
 @pytest.mark.parametrize("what", ["vertices", "edges"])

@@ -14,8 +14,8 @@
 // It ends when |r| <= Contact::tolerance max(|b|, |b + i H^T f|) with the law as it is then; a last solve to the tolerance of the step follows.
 //
 // The path of each point of the surface is then swept against all obstacles. Those that pass into one get a row where they enter, or a
-// stiffer one where they have it, and the passes go on, at most ROUNDS times, while there are any; what is still left is set to SHORT_OF of
-// the way and counted as clipped. A row stays stiffer as long as its force would press it through half of its thickness without that, so that a lasting load
+// stiffer one where they have it, and the passes go on, at most ROUNDS times, while there are any. What is still left at the end, after
+// bodies have been held apart, since obstacles do not give way, is set to SHORT_OF of the way and counted as clipped. A row stays stiffer as long as its force would press it through half of its thickness without that, so that a lasting load
 // that the given stiffness does not bear comes to rest.
 #pragma once
 #include "contact_copies.h"
@@ -42,7 +42,7 @@ static bool sweep_obstacles(Passes& p) {
     return true;
 }
 
-// Sets those that y still takes into one back; counts the nodes that are moved in the reports of their bodies.
+// Sets those that y still takes into one back, at the end of a step; counts the nodes that are moved in the reports of their bodies.
 static void hold_back(const Passes& p) {
     p.each_entry([&](int64_t k) { p.before[k] = p.y[k]; });
     ObstacleSweep(p).clip();
@@ -54,16 +54,15 @@ static void hold_back(const Passes& p) {
     }
 }
 
-// The step of an island whose rows are detected; of a body alone as without contact where nothing is touched.
-static void solve_island(Loop& loop, int island, bool resumes) {
+// The step of an island whose rows are detected; of a body alone as without contact where nothing is touched. enters: of each body,
+// whether y may take it into an obstacle
+static void solve_island(Loop& loop, int island, bool resumes, char* enters) {
     Passes p(loop, island);
     const int first = p.bodies[0], set = resumes ? 0 : p.choose_set();
     bool outside = false;  // y was swept and enters nothing
-    int already = -1;  // passes in which nodes were set back that still are; a step that begins has none
     if (p.count > 1) IslandSolver::make_modes(loop, p.c, p.bodies, p.count);
     if (resumes) {
         p.take_up();
-        already = p.report.passes;
         p.leave();
         p.move_points();
         p.solve(false);
@@ -97,42 +96,56 @@ static void solve_island(Loop& loop, int island, bool resumes) {
     if (p.result.status == NOT_FINITE) p.each_entry([&](int64_t k) { p.y[k] = NAN; });  // the kernel `advance` takes the bodies back
     for (int m = 0; m < p.count; ++m) {
         p.c.result[p.bodies[m]] = p.result;
-        const int clipped = p.report.passes == already ? p.c.report[p.bodies[m]].clipped : 0;  // those of the last solve count
         p.c.report[p.bodies[m]] = p.report;
-        p.c.report[p.bodies[m]].clipped = clipped;
+        enters[p.bodies[m]] = p.result.status != NOT_FINITE && !outside;
     }
-    if (p.result.status != NOT_FINITE && !outside) hold_back(p);
 }
 
-// Solves islands, those of several bodies first. resumes: only those that a sweep has given rows.
-static void solve_islands(Loop& loop, bool resumes) {
-    Contact& c = *loop.contact;
+// f(island), those of several bodies first.
+template <class F> static void each_island(Loop& loop, F f) {
+    const Contact& c = *loop.contact;
     auto size = [&](int i) { return c.island_start[i + 1] - c.island_start[i]; };
-    auto wanted = [&](int i) {
-        bool any = !resumes;
-        for (int k = c.island_start[i]; k < c.island_start[i + 1] && !any; ++k) any = c.touched[c.island[k]];
-        return any;
-    };
     for (int i = 0; i < c.islands; ++i)
-        if (size(i) > 1 && wanted(i)) solve_island(loop, i, resumes);
-    if (resumes && !c.own.near.start) return;
-    each_about_a_body(loop, c.islands, [&](int i) { return c.island[c.island_start[i]]; },
-                      [&](int i) { if (size(i) == 1 && wanted(i)) solve_island(loop, i, resumes); });
+        if (size(i) > 1) f(i);
+    each_about_a_body(loop, c.islands, [&](int i) { return c.island[c.island_start[i]]; }, [&](int i) { if (size(i) == 1) f(i); });
+}
+
+// Solves islands. resumes: only those that a sweep has given rows.
+static void solve_islands(Loop& loop, bool resumes, char* enters) {
+    const Contact& c = *loop.contact;
+    each_island(loop, [&](int i) {
+        bool wanted = !resumes;
+        for (int k = c.island_start[i]; k < c.island_start[i + 1] && !wanted; ++k) wanted = c.touched[c.island[k]];
+        if (wanted) solve_island(loop, i, resumes, enters);
+    });
+}
+
+// Sets back what the step takes into obstacles, where a body may come to one or was held apart from others.
+static void hold_islands_back(Loop& loop, const char* enters) {
+    const Contact& c = *loop.contact;
+    each_island(loop, [&](int i) {
+        const int first = c.island[c.island_start[i]];
+        const bool apart = c.report[first].clipped > 0 && c.result[first].status != NOT_FINITE;  // told of all of its bodies
+        if (enters[first] || apart) hold_back(Passes(loop, i));
+    });
 }
 
 // Solves all bodies whose step is not made. Those that pass through each other then get rows where they do, and are solved again. True
 // if one whose step is made is among them: then nothing is done yet.
 static bool solve_in_contact(Loop& loop) {
+    static thread_local std::vector<char> enters;
     Contact& c = *loop.contact;
+    enters.assign(loop.bodies, 0);
     find_islands(loop);
-    solve_islands(loop, false);
+    solve_islands(loop, false, enters.data());
     for (int k = 0; k < ROUNDS && c.pair_first >= 0; ++k) {
         if (!PairDetection(loop, c, loop.y).sweep(c.room, k == 0)) break;
         if (unmake_touched(loop)) return true;
         find_islands(loop);
-        solve_islands(loop, true);
+        solve_islands(loop, true, enters.data());
         if (k == ROUNDS - 1) PairDetection(loop, c, loop.y).hold_back(c.room, loop.y);
     }
+    hold_islands_back(loop, enters.data());
     for (int i = 0; i < c.islands; ++i) {
         Passes p(loop, i);
         p.conclude(!(c.report[p.bodies[0]].residual > c.tolerance));

@@ -178,29 +178,17 @@ struct ContactSearch : Passes {
         return search.phase != DONE;
     }
 
-    // Looks where y takes the island, from the start of the step. Gives what enters an obstacle rows there; lasts: or holds it back.
-    // Returns whether its search has to go on.
-    bool sweep(bool lasts) {
+    // Looks where y takes the island, from the start of the step. Gives what enters an obstacle rows there. Returns whether something
+    // does, so that its search has to go on.
+    bool sweep() {
         if (touches() && search.status == MAX_LINEARIZATIONS && c.report[bodies[0]].residual > c.tolerance) search.status = CONTACT;
         for (int m = 0; m < count; ++m) c.result[bodies[m]] = as_solve_result(search);
         if (lost()) return false;
         move_points();
         const bool acts = apply_law(false);
-        if (!sweep_obstacles(*this) && (touches() || !acts)) return false;
-        if (!lasts && search.status != NOT_FINITE) return true;
-        hold_back(*this);
-        return false;
+        return sweep_obstacles(*this) || (!touches() && acts);
     }
 };
-
-// f(island), those of several bodies first.
-template <class F> static void each_island(Loop& loop, F f) {
-    const Contact& c = *loop.contact;
-    auto size = [&](int i) { return c.island_start[i + 1] - c.island_start[i]; };
-    for (int i = 0; i < c.islands; ++i)
-        if (size(i) > 1) f(i);
-    each_about_a_body(loop, c.islands, [&](int i) { return c.island[c.island_start[i]]; }, [&](int i) { if (size(i) == 1) f(i); });
-}
 
 // Searches until all islands are done, and takes the bodies back to the start of the step; y is then the whole change of velocity.
 static void search_islands(Loop& loop) {
@@ -224,15 +212,19 @@ static void search_islands(Loop& loop) {
     loop.assemble_seconds += now() - begin - solving;
 }
 
-// Sweeps the paths of the step. Marks in `touched` the bodies whose search has to go on; returns whether there are such.
-static bool sweep_paths(Loop& loop, int round) {
+// Sweeps the paths of the step. Marks in `entered` the bodies whose search has to go on; returns whether there are such. enters: of each
+// body, whether its path is into an obstacle
+static bool sweep_paths(Loop& loop, int round, char* enters) {
     Contact& c = *loop.contact;
     int32_t* found = loop.newton->entered;
     std::fill_n(found, loop.bodies, 0);
     each_island(loop, [&](int i) {
         ContactSearch s(loop, i);
-        const bool enters = s.sweep(round == ROUNDS);
-        for (int m = 0; m < s.count; ++m) found[s.bodies[m]] = enters;
+        const bool into = s.sweep();
+        for (int m = 0; m < s.count; ++m) {
+            enters[s.bodies[m]] = into;
+            found[s.bodies[m]] = into && round < ROUNDS && s.search.status != NOT_FINITE;
+        }
     });
     if (c.pair_first >= 0) {
         const PairDetection pairs(loop, c, loop.y);
@@ -260,7 +252,9 @@ static void resume_searches(Loop& loop) {
 
 // The step of all bodies.
 static void search_in_contact(Loop& loop) {
+    static thread_local std::vector<char> enters;
     Contact& c = *loop.contact;
+    enters.assign(loop.bodies, 0);
     find_islands(loop);
     for (int i = 0; i < loop.bodies; ++i) {
         begin_search(loop, i);
@@ -268,10 +262,11 @@ static void search_in_contact(Loop& loop) {
     }
     each_island(loop, [&](int i) { ContactSearch(loop, i).begin(); });
     search_islands(loop);
-    for (int round = 0; round <= ROUNDS && sweep_paths(loop, round); ++round) {
+    for (int round = 0; round <= ROUNDS && sweep_paths(loop, round, enters.data()); ++round) {
         resume_searches(loop);
         search_islands(loop);
     }
+    hold_islands_back(loop, enters.data());
     for (int i = 0; i < c.islands; ++i) {
         Passes p(loop, i);
         p.conclude(true);  // that the law does not hold is known since the sweep
