@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from protocol.factor import Factor, FactorPattern
 from protocol.factors_together import FactorsTogether
 from protocol.shared_memory.located import Located, address, addresses
+from protocol.validate import helping_threads
 from sim_server.arrays import Int32
 from sim_server.backends.compiler import native
 from sim_server.backends.cpu import structs
@@ -30,6 +31,7 @@ MAX_RESIDUAL = 0.05  # |r - A P^-1 r| / |r| of a factor that is to take the plac
 WITH_FACTOR, WITH_BLOCK_JACOBI = 1, 2  # parts of a judgement (factor_check.cpp)
 NO_VALUES = np.zeros(1, np.float32)
 WORK = 9  # numbers for each degree of freedom
+FEW = 8  # factors for each thread, at least
 MIN_SHARE = 0.9  # of what block Jacobi takes off, for a factor to be used; not 1, as one vector is not the space
 
 
@@ -50,7 +52,7 @@ class Probe(NamedTuple):
 
 @cache
 def _library() -> c.CDLL:
-    arguments = [c.c_int32, c.c_int32, *[c.c_void_p] * 9]
+    arguments = [c.c_int32, c.c_int32, *[c.c_void_p] * 9, c.c_int64, c.c_int32]
     library = native("backends/cpu/native/factor_check.cpp", {"wf_judge_all": (None, arguments)}, stepping=False)
     structs.LOOP.check_sizes(library)
     return library
@@ -215,14 +217,15 @@ class FactorCheck:
         factors, nodes = np.zeros(count, FACTOR), np.array([body.nodes for body in bodies], np.int32)
         factors["pattern"], factors["values"] = pattern, addresses(values)
         factors["bytes"] = [each.itemsize for each in values]
-        if (needed := WORK * 3 * int(nodes.max())) > len(self._work):
-            self._work = np.empty(needed)
+        threads, room = 1 + min(helping_threads(), count // FEW), WORK * 3 * int(nodes.max())
+        if threads * room > len(self._work):
+            self._work = np.empty(threads * room)
         there = [k for k, matrix in enumerate(matrices) if matrix is not None]
         known = np.zeros(count, np.uintp)  # addresses of matrices
         known[there] = addresses([matrix for matrix in matrices if matrix is not None])
         z, out = np.full(count, 0 if applied is None else address(applied), np.uintp), np.zeros((count, 5))
         arrays = factors, nodes, row_start, columns, known, r, z, self._work, out
-        _library().wf_judge_all(count, parts, *map(address, arrays))
+        _library().wf_judge_all(count, parts, *map(address, arrays), room, threads)
         return out
 
     def _known(
