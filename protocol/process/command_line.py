@@ -10,6 +10,7 @@ import signal
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from types import FrameType
 from typing import Any, NoReturn
 
@@ -17,6 +18,7 @@ import typer
 
 from protocol.process.exhausted import exhausted
 from protocol.process.extras import missing_extra
+from protocol.process.held_signals import hold
 
 RETRY = 0.01  # s until a signal that came in the middle of an import is handled again
 
@@ -75,7 +77,8 @@ def _terminate(*_: object) -> None:
 
 
 def handle(number: signal.Signals, act: Callable[[int, FrameType | None], object]) -> None:
-    """Handles a signal by `act`, which raises, though never in the middle of an import.
+    """Handles a signal by `act`, which raises, though never in the middle of an import, nor where it is to wait
+    (held_signals).
 
     There an exception may be swallowed or wrapped. A signal that a parent has its children ignore stays ignored.
     """
@@ -84,7 +87,7 @@ def handle(number: signal.Signals, act: Callable[[int, FrameType | None], object
         if _importing(frame) and hasattr(signal, "setitimer"):  # Windows has none
             signal.signal(signal.SIGALRM, lambda *_: signal.raise_signal(number))
             signal.setitimer(signal.ITIMER_REAL, RETRY)
-        else:
+        elif not hold(partial(act, number, frame)):
             act(number, frame)
 
     if signal.getsignal(number) is not signal.SIG_IGN:
