@@ -23,7 +23,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from protocol import messages_pb2 as pb
-from protocol.process.held_signals import HeldSignal, held_signals
 from protocol.process.notify import Notifier
 from protocol.process.nvidia import nvidia_device
 from protocol.process.version import version
@@ -149,13 +148,12 @@ class Service:
         """Returns True for an object that has run away and is frozen."""
         return name in self.driver.by_name and self.driver.by_name[name].frozen
 
-    def run(self) -> None:
-        """Blocks until the run is over. A signal to end ends the loop first, after the round under way, so that no
-        record that a round has taken is lost, and is then raised."""
-        with held_signals() as signal:
-            self._run(signal)
+    def run(self, is_told_to_end: Callable[[], bool] = lambda: False) -> None:
+        """Blocks until the run is over.
 
-    def _run(self, signal: HeldSignal) -> None:
+        is_told_to_end: looked at between rounds; what a round has taken from the loop is in the log then. An exception
+        in the middle of one, such as KeyboardInterrupt, ends the loop, too, and is then raised
+        """
         if not self.link.dispatch.workers():
             self._first = None  # nobody makes any
         loop = threading.Thread(target=self._loop, name="loop")
@@ -163,7 +161,7 @@ class Service:
             self._drain()  # asks for the matrices of the first step, and not of the one that is due dt later
         try:
             loop.start()  # inside: a signal may come before it returns, when the thread runs already
-            while loop.is_alive() and not (self.commands.stopping or signal.came):
+            while loop.is_alive() and not (self.commands.stopping or is_told_to_end()):
                 begin = time.monotonic()
                 self.round()
                 if self._between.waits and self._first is None:

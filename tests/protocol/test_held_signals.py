@@ -7,8 +7,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from protocol.process.command_line import Terminated, end_in_order
-from protocol.process.held_signals import held_signals
+from protocol.process.command_line import Terminated, end_in_order, held_signals
 
 
 @pytest.fixture(autouse=True)
@@ -22,10 +21,10 @@ def handlers() -> Iterator[None]:
 
 def test_the_first_waits_until_the_end():
     done = False
-    with pytest.raises(Terminated), held_signals() as held:
-        assert not held.came
+    with pytest.raises(Terminated), held_signals() as waits:
+        assert not waits()
         signal.raise_signal(signal.SIGTERM)
-        done = held.came
+        done = waits()
     assert done
     with pytest.raises(KeyboardInterrupt):
         signal.raise_signal(signal.SIGINT)

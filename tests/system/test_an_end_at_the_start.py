@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from protocol.process.command_line import Terminated, end_in_order
+from protocol.process.command_line import Terminated, end_in_order, held_signals
 from sim_server.network.link import ServerLink
 from sim_server.recording.recorder import Recorder
 from sim_server.replay.log import Recording
@@ -53,8 +53,8 @@ def test_a_signal_once_records_are_taken_loses_none_of_them(tmp_path: Path, monk
         monkeypatch.setattr(service.driver, "pump", pumped)
         end_in_order()
         try:
-            with pytest.raises(Terminated):
-                service.run()
+            with pytest.raises(Terminated), held_signals() as is_told_to_end:
+                service.run(is_told_to_end)
         finally:
             for number, handler in before.items():
                 signal.signal(number, handler)
