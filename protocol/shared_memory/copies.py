@@ -77,21 +77,19 @@ class Copies:
 
     def copy(
         self, sources: Sequence[NDArray[Any]], targets: Sequence[NDArray[Any]], own_sources: bool = False
-    ) -> tuple[list[int], list[bool]]:  # fmt: skip
-        """Copies each source to its target, of the same number of bytes. Returns of each target its `checksum` and
-        `all_finite`.
+    ) -> list[int]:  # fmt: skip
+        """Copies each source to its target, of the same number of bytes. Returns the `checksum` of each target.
 
-        own_sources: other processes may write to the targets, so both are told of the sources; else these may be
+        own_sources: other processes may write to the targets, so that of the sources is told; else these may be
         written to meanwhile
         """
         if self._library is None:
-            pairs = zip(sources, targets, strict=True)
-            made = [copied(s, t.view(s.dtype), s if own_sources else t.view(s.dtype)) for s, t in pairs]
-            return [each[0] for each in made], [each[1] for each in made]
-        size, item = _sizes(sources)
+            pairs = [(s, t.view(s.dtype)) for s, t in zip(sources, targets, strict=True)]
+            return [copied(s, t, s if own_sources else t)[0] for s, t in pairs]
+        size, _ = _sizes(sources)
         if any(s.nbytes != t.nbytes or not t.flags.c_contiguous for s, t in zip(sources, targets, strict=True)):
             raise ValueError("a target is not contiguous, or not of the bytes of its source")
-        return self._call(_addresses(sources), _addresses(targets), size, item, own_sources)[:2]
+        return self._call(_addresses(sources), _addresses(targets), size, 0, own_sources)[0]
 
     def take(
         self, source: Parts, counts: NDArray[np.int64], memory: NDArray[Any], diagonals: Sequence[NDArray[np.int64]]

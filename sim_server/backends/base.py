@@ -261,6 +261,11 @@ class Engine(Protocol):
     def post_factors(self, bodies: Sequence[int], factors: Sequence[Factor]) -> None:
         """Posts factors of different bodies, one of each. Their values do not change any more."""
 
+    def prepare_together(self, bodies: Sequence[int], factors: FactorsTogether) -> None:
+        """Makes ready what it takes to use factors of different bodies, without waiting; each is used once its values
+        are posted, else it must be dropped, or is by the next one of its body. From any thread."""
+        ...
+
     def post_together(self, bodies: Sequence[int], factors: FactorsTogether) -> None:
         """Posts factors that came together, as `post_factors`."""
 

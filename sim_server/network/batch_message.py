@@ -69,8 +69,7 @@ def fill(message: MatrixBatch, matrices: Sequence[Float64], slot: Slot) -> None:
     thread."""
     ends = np.cumsum([matrix.size for matrix in matrices])
     parts = np.split(slot.array(np.float64, int(ends[-1])), ends[:-1])
-    sums, _ = native_copies().copy([np.ascontiguousarray(matrix) for matrix in matrices], parts)
-    message.checksums.extend(sums)
+    message.checksums.extend(native_copies().copy([np.ascontiguousarray(each) for each in matrices], parts))
 
 
 def group(job: Job) -> tuple[str, Method]:

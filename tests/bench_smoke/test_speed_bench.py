@@ -6,10 +6,10 @@ from typing import Any
 import pytest
 
 from tests.bench.harness.report import ROOT
-from tests.bench.speed.__main__ import UNITS
+from tests.bench.speed.__main__ import UNITS, groups
 from tests.bench.speed.page import KEYS, of_runs, summary
 from tests.bench.speed.targets import TARGETS
-from tests.bench.speed.turns import Side, in_turn, percentiles
+from tests.bench.speed.turns import Side, percentiles
 
 
 def row_of(unit: str) -> dict[str, Any]:
@@ -69,15 +69,10 @@ def test_a_gain_is_one_of_a_run() -> None:
     assert summary(rows)[1]["gain"] == "1.5 x"
 
 
-def test_a_side_that_fails_leaves_the_other() -> None:
-    def fails(what: str, **_: Any) -> dict[str, Any]:
-        raise RuntimeError("too old")
-
-    sides: Any = {"before": fails, "after": lambda what, **order: {"p50": order["seconds"]}}
-    found = in_turn(sides, "many", {"tets": 540}, seconds=2.0)
-    assert found == [{"what": "many", "tets": 540, "side": "after", "p50": 2.0}]
-    with pytest.raises(RuntimeError, match="before: too old"):
-        in_turn({"before": sides["before"]}, "many", {"tets": 540})
+def test_servers_are_measured_one_by_one() -> None:
+    sides: Any = {"before": object(), "after": object()}
+    assert groups(sides, "steps:540") == [sides]
+    assert groups(sides, "real_time:540") == [{"before": sides["before"]}, {"after": sides["after"]}]
 
 
 def test_a_side_says_what_went_wrong_and_goes_on() -> None:

@@ -310,6 +310,9 @@ class CpuEngine(Reports):
             buffer.take(factor.values, factor.step)
             self._mail[body].post(buffer)
 
+    def prepare_together(self, bodies: Sequence[int], factors: FactorsTogether) -> None:
+        """Does nothing: factors are applied as they come."""
+
     def post_together(self, bodies: Sequence[int], factors: FactorsTogether) -> None:
         """Posts factors that came together, as `post_factors`."""
         self.post_factors(bodies, factors)

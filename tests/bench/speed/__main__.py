@@ -33,6 +33,7 @@ UNITS = (
     "steps:3000:256", "real_time:24000", "real_time:98304", "many:540:512", "many:540:1024",
     "swinging:540:512", "swinging:540:1024", "vbd:3000",
 )  # fmt: skip
+ONE_BY_ONE = ("real_time", "many", "swinging")
 DT, VBD_DT = 0.03, 0.02  # s, of steps in real time; of the scene of Newton's VBD
 
 
@@ -70,6 +71,13 @@ def measured(sides: Sides, unit: str, o: argparse.Namespace) -> list[Row]:
         exact = ["integrator.linearizations=20", "integrator.tolerance=1e-10", "solver.tolerance=1e-8"]
         return turns.motion(now, {"tets": tets}, text, ours, exact, o.device)
     raise SystemExit(f"bench speed: unit {unit!r}; allowed: {' '.join(UNITS)} and the like")
+
+
+def groups(sides: Sides, unit: str) -> list[Sides]:
+    """Those that are measured at once: servers one after the other, so that one is kept if the other fails."""
+    if unit.startswith(ONE_BY_ONE):
+        return [{name: side} for name, side in sides.items()]
+    return [sides]
 
 
 def commit_of(checkout: Path) -> str:
@@ -121,17 +129,18 @@ def main() -> None:
         for unit in o.units:
             if limit.reached(unit):
                 continue
-            try:
-                found = measured(sides, unit, o)
-            except RuntimeError as error:
-                print(f"FAILED {unit}: {error}", file=sys.stderr, flush=True)
-                continue
-            on_cpu = o.device == "cpu" or unit.startswith(("threads", "sofa"))
-            rows += [{**row, "on": place["cpu" if on_cpu else "gpu"]} for row in found]
-            report.data["rows"] = rows
-            report.keep()
-            for row in found:
-                say(shown(row))
+            for group in groups(sides, unit):
+                try:
+                    found = measured(group, unit, o)
+                except RuntimeError as error:
+                    print(f"FAILED {unit} {' '.join(group)}: {error}", file=sys.stderr, flush=True)
+                    continue
+                on_cpu = o.device == "cpu" or unit.startswith(("threads", "sofa"))
+                rows += [{**row, "on": place["cpu" if on_cpu else "gpu"]} for row in found]
+                report.data["rows"] = rows
+                report.keep()
+                for row in found:
+                    say(shown(row))
     limit.tell()
     page.write(report, rows)
 

@@ -101,7 +101,7 @@ TABLES = (
         "A server of many small bodies",
         "As fast as it goes, one worker process on the same device, measured by its statuses after each body has "
         "had two factors (ready; or ten seconds): beams that come to rest meanwhile. Without: bodies that had none. "
-        "Ages: of the newest factor of each body at each look. Host us: processor time of the loop's thread for a "
+        "Ages: of factors at each look. Host us: processor time of the loop's thread for a "
         "step, with what it does for the factors that come in.",
     ),
     (

@@ -3,6 +3,11 @@
 //
 // Factors of one pattern are applied TOGETHER at a time. In a triangle of L each number waits for the one before, which takes most of
 // the time of a small factor; those of others are worked on meanwhile. Each gets the same bits as if it were alone.
+#include <atomic>
+#include <exception>
+#include <thread>
+#include <vector>
+
 #include "pcg.h"
 #include "sizes.h"
 
@@ -127,26 +132,28 @@ __attribute__((noinline)) void judge(int parts, const Body& body, const double* 
     out[3] = multiply(A, jacobi, q);
 }
 
-}  // namespace
+// What wf_judge_all is given.
+struct Given {
+    int32_t count, parts;
+    const Factor* factors;
+    const int32_t *nodes, *const *row_start, *const *columns;
+    const double *const *values, *const *r, *const *applied;
+    double* out;
 
-extern "C" {
+    // How many factors from the i-th on are applied together.
+    int together(int i) const {
+        bool all = i + TOGETHER <= count;
+        for (int f = 1; f < TOGETHER && all; ++f)
+            all = alike(factors[i], factors[i + f]) && r[i] == r[i + f] && !applied[i] && !applied[i + f];
+        return all ? TOGETHER : 1;
+    }
 
-// Judges `count` factors; entry i of each array is of factor i. parts: of Part. nodes, row_start, columns, values: A, its nodes
-// numbered from 0; values null: unknown. r: probe vector. applied: z, where the factor has been applied already: its values may be
-// null then. work: for the largest of them 9 entries for each degree of freedom. out (count, 5): z.r and z.Az with the factor, then
-// both with block Jacobi, and |r - Az| / |r| with the factor; without A only the first is written.
-void wf_judge_all(int32_t count, int32_t parts, const Factor* factors, const int32_t* nodes, const int32_t* const* row_start,
-                  const int32_t* const* columns, const double* const* values, const double* const* r, const double* const* applied,
-                  double* work, double* out) {
-    for (int i = 0, some; i < count; i += some) {
+    // Judges `some` factors from the i-th on.
+    void judge_some(int i, int some, double* work) const {
         Body body[TOGETHER];
         const double* z[TOGETHER];
         double* made[TOGETHER];
         const int64_t n = 3 * (int64_t)nodes[i];
-        bool together = i + TOGETHER <= count;
-        for (int f = 1; f < TOGETHER && together; ++f)
-            together = alike(factors[i], factors[i + f]) && r[i] == r[i + f] && !applied[i] && !applied[i + f];
-        some = together ? TOGETHER : 1;
         for (int f = 0; f < some; ++f) {
             body[f] = {{0, nodes[i + f], row_start[i + f], columns[i + f], values[i + f]}, r[i + f]};
             z[f] = made[f] = work + f * n;
@@ -154,12 +161,40 @@ void wf_judge_all(int32_t count, int32_t parts, const Factor* factors, const int
         double *room = work + TOGETHER * n, *own = out + 5 * i;
         if (parts & WITH_FACTOR) {
             if (applied[i]) own[0] = dot(body[0].A, z[0] = applied[i], r[i]);
-            else if (together) apply<TOGETHER>(body, factors + i, made, room, own);
+            else if (some == TOGETHER) apply<TOGETHER>(body, factors + i, made, room, own);
             else apply<1>(body, factors + i, made, room, own);
         }
         for (int f = 0; f < some; ++f)
             if (values[i + f]) judge(parts, body[f], z[f], room, own + 5 * f);
     }
+};
+
+}  // namespace
+
+extern "C" {
+
+// Judges `count` factors; entry i of each array is of factor i. parts: of Part. nodes, row_start, columns, values: A, its nodes
+// numbered from 0; values null: unknown. r: probe vector. applied: z, where the factor has been applied already: its values may be
+// null then. work: `room` entries for each thread, for the largest of the factors 9 for each degree of freedom. out (count, 5): z.r and
+// z.Az with the factor, then both with block Jacobi, and |r - Az| / |r| with the factor; without A only the first is written.
+// threads: that share the factors, this one among them, if there are so many.
+void wf_judge_all(int32_t count, int32_t parts, const Factor* factors, const int32_t* nodes, const int32_t* const* row_start,
+                  const int32_t* const* columns, const double* const* values, const double* const* r, const double* const* applied,
+                  double* work, double* out, int64_t room, int32_t threads) {
+    const Given given = {count, parts, factors, nodes, row_start, columns, values, r, applied, out};
+    std::vector<std::pair<int, int>> groups;  // the first of some that are applied together, and their number
+    for (int i = 0, some; i < count; i += some) groups.emplace_back(i, some = given.together(i));
+    std::atomic<size_t> next{0};
+    auto judge_next = [&](double* own) {
+        for (size_t k = next++; k < groups.size(); k = next++) given.judge_some(groups[k].first, groups[k].second, own);
+    };
+    std::vector<std::thread> others;
+    try {
+        for (int32_t k = 1; k < threads; k++) others.emplace_back(judge_next, work + k * room);
+    } catch (const std::exception&) {  // the system gives no more of them, or no memory: those that there are do it
+    }
+    judge_next(work);
+    for (std::thread& each : others) each.join();
 }
 
 const StructSize* wf_sizes() {
