@@ -18,8 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from protocol.factor import Factor, FactorPattern
-from protocol.factors_together import FactorsTogether
 from sim_server.arrays import Float64, Int32, Int64
+from sim_server.backends.factors_together import FactorsTogether
 from sim_server.backends.shared_memory import SharedMemory
 from sim_server.backends.state import StateArray
 

@@ -112,7 +112,7 @@ class JobSender:
         idle = [name for name, room in rooms.items() if room > 0]
         failing = bool(self._book.reliability.failing_objects)
         simple = len(idle) == 1 and idle[0] in able and not failing and len(jobs) <= rooms[idle[0]]
-        if simple and (alike := self._alike(jobs)) is not None:
+        if simple and (alike := self.alike(jobs)) is not None:
             return self._send_batches(idle[0], alike)
         sized: list[tuple[Job, AnnouncedObject, int]] = []  # by place
         last: tuple[str, str, Method] | None = None  # worker, dtype and method of the job before, by identity
@@ -141,7 +141,7 @@ class JobSender:
                 taken[place] = well
         return taken
 
-    def _alike(self, jobs: Sequence[Job]) -> list[tuple[Job, AnnouncedObject, int]] | None:
+    def alike(self, jobs: Sequence[Job]) -> list[tuple[Job, AnnouncedObject, int]] | None:
         """Returns what is known of the objects of jobs, and how many values their factors have, if all of them may
         share batches, as those of many small bodies do, for which it takes less time than what `submit_many` does else.
         None: they may not."""

@@ -17,13 +17,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from protocol.factor import Factor, FactorPattern
-from protocol.factors_together import FactorsTogether
 from protocol.shared_memory.located import Located, address, addresses
 from protocol.validate import helping_threads
 from sim_server.arrays import Int32
 from sim_server.backends.compiler import native
 from sim_server.backends.cpu import structs
 from sim_server.backends.cpu.factors import NativePattern
+from sim_server.backends.factors_together import FactorsTogether
 from sim_server.updates.patterns import Patterns
 
 Reals = NDArray[np.float64]

@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from protocol.factors_together import FactorsTogether
 from sim_server.arrays import Float64
+from sim_server.backends.factors_together import FactorsTogether
 from sim_server.updates.body_state import BodyUpdateState, MadeFactors, on_checks, on_factors
 from sim_server.updates.factor_source import Check
 from sim_server.updates.update_table import NONE

@@ -739,7 +739,10 @@ def test_few_are_not_prepared(many):
     maker, upload, boxes = many
     upload.prepare_many(given(boxes, 10)[:-2])
     maker.thread.submit(lambda: None).result()
-    assert maker.storages == [] and not upload._uploads[0].comes
+    assert maker.storages == []
+    post_all(upload, [7] * len(boxes))
+    maker.thread.submit(lambda: None).result()
+    assert [box.posted for box in boxes] == [7] * len(boxes)
 
 
 def test_of_several_of_one_body_among_many_the_last_one_is_used(many):

@@ -163,25 +163,26 @@ def test_answers_may_come_in_parts_and_in_any_order(stage: Hand) -> None:
 def test_jobs_that_are_looked_up_at_once_travel_as_those_looked_up_one_by_one(
     stage: Hand, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    found, real, used = [], JobSender._alike, []
+    found, real, used, senders = [], JobSender.alike, [], set()
 
     def alike(sender: JobSender, given: Any) -> Any:
+        senders.add(sender)
         used.append(real(sender, given))
         return used[-1] if found else None
 
     for name in NAMES:
         stage.driver.link.dispatch.factor_helped("hand", name)  # what failed in other tests is forgotten
-    monkeypatch.setattr(JobSender, "_alike", alike)
+    monkeypatch.setattr(JobSender, "alike", alike)
     for _ in range(2):
         batch = stage.batch()
         found.append({name: list(getattr(batch, name)) for name in ("objects", "epochs", "warps", "blocks", "rooms")})
         stage.send(stage.answer(batch))
         stage.driver.until(lambda: stage.made() == set(NAMES), "their factors")
     assert found[0] == found[1] and None not in used and len(used) == 2
-    sender, flying = stage.driver.link.dispatch._sender, stage.batch(("a", "b"))
-    assert sender._alike(jobs(950, ("b", "c"))) is None, "one has a job in flight"
-    assert sender._alike([*jobs(950, ("c",)), *jobs(951, ("c",))]) is None, "twice the same"
-    assert sender._alike([*jobs(950, ("c",)), *jobs(950, ("d",), dtype="float64")]) is None
+    (sender,), flying = senders, stage.batch(("a", "b"))
+    assert real(sender, jobs(950, ("b", "c"))) is None, "one has a job in flight"
+    assert real(sender, [*jobs(950, ("c",)), *jobs(951, ("c",))]) is None, "twice the same"
+    assert real(sender, [*jobs(950, ("c",)), *jobs(950, ("d",), dtype="float64")]) is None
     stage.send(stage.answer(flying))
     stage.driver.until(lambda: stage.made() == {"a", "b"}, "their factors")
 
@@ -386,7 +387,10 @@ def test_large_batches_are_checked_where_they_are_decoded(
 def test_large_batches_are_decoded_beside_the_caller(stage: Hand, monkeypatch: pytest.MonkeyPatch) -> None:
     """All count as large here. Meanwhile nothing is taken and second answers are refused; then each counts alone."""
     monkeypatch.setattr(factor_intake, "LARGE_MESSAGE", 0)
+    dispatch = stage.driver.link.dispatch
+    free = dispatch.ready()
     batch, go = stage.batch(), threading.Event()
+    assert dispatch.ready() == free - len(NAMES)
     decode, before = stage.driver.link.dispatch.decoder.decode_several, stage.driver.link.counters.refusals["duplicate"]
 
     def slow(*arguments: Any) -> Any:
@@ -400,6 +404,7 @@ def test_large_batches_are_decoded_beside_the_caller(stage: Hand, monkeypatch: p
     stage.send(stage.answer(batch, [0]))
     stage.driver.until(lambda: stage.driver.link.counters.refusals["duplicate"] == before + 2, "the second answers")
     assert not stage.driver.factors and stage.driver.link.slots_lent == 2
+    assert dispatch.ready() == free, "its worker has done them"
     go.set()
     stage.driver.until(lambda: all_are_back(stage), "the factors")
     stage.check_factors()

@@ -10,9 +10,11 @@ import numpy as np
 import pytest
 
 from protocol.factor import Factor
-from protocol.factors_together import FactorsTogether
+from protocol.method import Method
+from sim_server.backends.factors_together import FactorsTogether
 from sim_server.simulation import Simulation
 from sim_server.updates.driver import Driver
+from sim_server.updates.factor_check import FactorCheck
 from sim_server.updates.factor_source import FactorSource, Job
 from sim_server.updates.many_factors import MANY
 from sim_server.updates.update_table import NONE
@@ -79,7 +81,7 @@ def in_flight(driver: Driver, body: int) -> None:
     driver.engine.assemble()
     values = np.array(driver.simulation.system.body_values(b.first, b.last))
     driver.engine.solve()
-    state.on_job(step, driver._method)
+    state.on_job(step, Method())
     state.job.set_copy(values)
     state.on_sent(step)
 
@@ -282,10 +284,12 @@ def test_each_of_them_is_judged_as_if_it_came_alone():
     factors = spoilt(made(driver), [1, 6])
     matrices = [state.job.matrix[1] for state in driver.bodies]
     matrices[2] = None
-    check = driver.check
+    sim = driver.simulation
+    patterns = {b.name: sim.system.body_pattern(b.first, b.last) for b in sim.world.bodies}
+    check = FactorCheck(patterns)
     alone = [check.reject_reasons([each])[0] for each in zip(factors, matrices, strict=True)]
     assert check.reject_together(factors, matrices) == alone and [bool(a) for a in alone].count(True) == 2
-    check._patterns._given["bar3"] = driver.simulation.system.body_pattern(0, driver.simulation.world.bodies[1].last)
+    patterns["bar3"] = sim.system.body_pattern(0, sim.world.bodies[1].last)
     told = check.reject_together(factors, matrices)
     assert told[3].startswith("its size is") and told[:3] + told[4:] == alone[:3] + alone[4:]
 

@@ -18,10 +18,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from protocol.factor import Factor, FactorPattern
-from protocol.factors_together import FactorsTogether
 from sim_server.arrays import Float64
 from sim_server.backends.base import ArrayChange, Capability, EngineInput, Launch
 from sim_server.backends.cpu.structs import REACTION
+from sim_server.backends.factors_together import FactorsTogether
 from sim_server.backends.gpu.central_difference import ESTIMATE_EVERY
 from sim_server.backends.gpu.cuda import CudaDevice
 from sim_server.backends.gpu.cupy_types import Graph
