@@ -721,8 +721,12 @@ struct PcgSolver {
     __device__ __forceinline__ void leave(bool from_start, double r2) {
         const BlockRows& rows = memory.rows;
         real* r = s.own_vectors + 3ll * (memory.body.first + rows.begin) + 3ll * s.nodes;
-        for (int k = threadIdx.x; k < 3 * rows.own; k += THREADS) r[k] = rows.r[k] - (from_start ? rows.q[k] : 0);
-        if (!from_start) give(0, 0);
+        real* x = s.y + 3ll * (memory.body.first + rows.begin);
+#pragma unroll 1
+        for (int k = threadIdx.x; k < 3 * rows.own; k += THREADS) {
+            r[k] = rows.r[k] - (from_start ? rows.q[k] : 0);
+            if (!from_start) x[k] = 0;
+        }
         memory.out.status = SLOW;
         memory.out.residual = sqrt(r2 / memory.b2);
     }

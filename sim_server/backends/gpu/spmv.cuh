@@ -175,7 +175,8 @@ struct BlockRows {
         }
 #endif
         copies_begin();
-        if (slabs >= 0 && !lent) ask_first(row_start);
+        if (slabs >= 0 && !lent)
+            for (int k = 0; k < SLABS - 1; ++k) ask(k, row_start);
         if (start) row_start = start;
     }
 
@@ -201,9 +202,6 @@ struct BlockRows {
             all_of(to + value_bytes(slab_blocks), columns + s.first, 4 * s.count);
         }
         copies_begin();
-    }
-    __device__ __forceinline__ void ask_first(const int* starts) const {
-        for (int k = 0; k < SLABS - 1; ++k) ask(k, starts);
     }
     static __device__ __forceinline__ void all_of(char* to, const void* from, int bytes) {
         const int skipped = (int)((unsigned long long)from & 15);
@@ -386,12 +384,14 @@ struct BlockRows {
     template <class Done>
     __device__ __forceinline__ void through_slabs(Done done) const {
         const int count = (own + SLABS * SLAB - 1) / (SLABS * SLAB) * SLABS;
-        if (lent) ask_first(row_start);
-        for (int k = 0; k < count; ++k) {
-            copies_end<SLABS - 2>();
-            __syncthreads();  // this slab is complete, and the one before is not read any more
-            if (k + SLABS - 1 < count) ask(k + SLABS - 1, row_start);
-            else copies_begin();
+        for (int k = lent ? 1 - SLABS : 0; k < count; ++k) {  // one place that asks: its code is long
+            if (k >= 0) {
+                copies_end<SLABS - 2>();
+                __syncthreads();  // this slab is complete, and the one before is not read any more
+            }
+            const int next = k + SLABS - 1;
+            if (next < count || !lent) ask(next < count ? next : next - count, row_start);
+            if (k < 0) continue;
             const Slab s = slab(k, row_start);
             const int first = s.low + (int)threadIdx.x / 32;
             if (first >= s.high) continue;
@@ -410,7 +410,6 @@ struct BlockRows {
             of_near<SLAB_ROWS>(first, s.high, base + s.first, a, c, sum);
             finish<SLAB_ROWS>(first, s.high, sum, done);
         }
-        if (!lent) ask_first(row_start);
     }
 
     // Passes the sums of rows first, first + WARPS, ... to `done`: lane 3 n + c has entry c of the n-th row.
