@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from protocol.network.endpoints import default_endpoint
-from protocol.process.command_line import Program, Terminated, end_in_order
+from protocol.process.command_line import Program, Terminated, end_in_order, held_signals
 from protocol.process.memory import keep_long_lived
 from protocol.process.notify import Notifier
 from sim_server.errors import DeviceLost, InputError
@@ -202,7 +202,8 @@ def run(o: Options, say: Callable[[str], None]) -> int:
             service.health.notifier = notifier
             notifier.ready(f"{o.scene.name} on {', '.join(o.listen or ['loopback'])}")
             try:
-                service.run()
+                with held_signals() as is_told_to_end:
+                    service.run(is_told_to_end)
             finally:
                 notifier.stopping()
                 say(summary(service))

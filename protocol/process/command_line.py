@@ -8,8 +8,10 @@ import contextlib
 import os
 import signal
 import sys
-from collections.abc import Callable
+import threading
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from types import FrameType
 from typing import Any, NoReturn
 
@@ -18,6 +20,7 @@ import typer
 from protocol.process.exhausted import exhausted
 from protocol.process.extras import missing_extra
 
+_held: list[list[Callable[[], object]]] = []  # the signal that waits, or none yet; the innermost last
 RETRY = 0.01  # s until a signal that came in the middle of an import is handled again
 
 
@@ -75,7 +78,8 @@ def _terminate(*_: object) -> None:
 
 
 def handle(number: signal.Signals, act: Callable[[int, FrameType | None], object]) -> None:
-    """Handles a signal by `act`, which raises, though never in the middle of an import.
+    """Handles a signal by `act`, which raises, though never in the middle of an import, nor where it is to wait
+    (held_signals).
 
     There an exception may be swallowed or wrapped. A signal that a parent has its children ignore stays ignored.
     """
@@ -84,11 +88,33 @@ def handle(number: signal.Signals, act: Callable[[int, FrameType | None], object
         if _importing(frame) and hasattr(signal, "setitimer"):  # Windows has none
             signal.signal(signal.SIGALRM, lambda *_: signal.raise_signal(number))
             signal.setitimer(signal.ITIMER_REAL, RETRY)
+        elif _held and not _held[-1]:
+            _held[-1].append(partial(act, number, frame))
         else:
             act(number, frame)
 
     if signal.getsignal(number) is not signal.SIG_IGN:
         signal.signal(number, handler)
+
+
+@contextlib.contextmanager
+def held_signals() -> Iterator[Callable[[], bool]]:
+    """Within it the first signal waits until the end: raised at whatever line is under way, it would leave half done
+    what that does. What is returned says whether one waits. A second one acts at once, and an error comes first.
+
+    In the main thread, which alone gets signals; elsewhere none waits.
+    """
+    waiting: list[Callable[[], object]] = []
+    main = threading.current_thread() is threading.main_thread()
+    if main:
+        _held.append(waiting)
+    try:
+        yield lambda: bool(waiting)
+    finally:
+        if main:
+            _held.pop()
+    for act in waiting:
+        act()
 
 
 def _importing(frame: FrameType | None) -> bool:

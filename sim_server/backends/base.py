@@ -18,8 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from protocol.factor import Factor, FactorPattern
-from protocol.factors_together import FactorsTogether
 from sim_server.arrays import Float64, Int32, Int64
+from sim_server.backends.factors_together import FactorsTogether
 from sim_server.backends.shared_memory import SharedMemory
 from sim_server.backends.state import StateArray
 
@@ -260,6 +260,11 @@ class Engine(Protocol):
 
     def post_factors(self, bodies: Sequence[int], factors: Sequence[Factor]) -> None:
         """Posts factors of different bodies, one of each. Their values do not change any more."""
+
+    def prepare_together(self, bodies: Sequence[int], factors: FactorsTogether) -> None:
+        """Makes ready what it takes to use factors of different bodies, without waiting; each is used once its values
+        are posted, else it must be dropped, or is by the next one of its body. From any thread."""
+        ...
 
     def post_together(self, bodies: Sequence[int], factors: FactorsTogether) -> None:
         """Posts factors that came together, as `post_factors`."""

@@ -196,6 +196,12 @@ def ahead(*paths: str) -> None:
         begin(SOURCES / path)
 
 
+def names(*paths: str) -> list[str]:
+    """Returns the names of the libraries of host-only texts of this package; begins to compile those that are not
+    there."""
+    return [begin(SOURCES / path).name for path in paths]
+
+
 def build_id() -> str:
     """Digest of the compiled code in use, with the variant of a wheel's: equal ones repeat a run bit for bit."""
     made = hashlib.sha256("\0".join(sorted(libraries)).encode()).hexdigest()[:24]

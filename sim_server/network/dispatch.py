@@ -15,11 +15,11 @@ import zenoh
 from protocol.channels import CHANNELS, name_in
 from protocol.counters import Counters
 from protocol.factor import Factor, FactorPattern
-from protocol.factors_together import FactorsTogether
 from protocol.messages_pb2 import Topology, WorkerInfo
 from protocol.refused import Refused
 from protocol.shared_memory.pool import Slot, SlotPool
 from protocol.validate import take
+from sim_server.backends.factors_together import FactorsTogether
 from sim_server.network.bookkeeping import Bookkeeping
 from sim_server.network.device_slots import DeviceSlot, DeviceSlots
 from sim_server.network.factor_decoder import FactorDecoder

@@ -12,7 +12,6 @@ import numpy as np
 
 from protocol.channels import CHANNELS, MOST_JOBS, name_in
 from protocol.factor import Factor, FactorPattern, check_values
-from protocol.factors_together import FactorsTogether
 from protocol.messages_pb2 import DeviceSlot as DeviceSlotMessage
 from protocol.messages_pb2 import Factor as FactorMessage
 from protocol.messages_pb2 import FactorBatch, Topology
@@ -35,6 +34,7 @@ from protocol.validate import (
     topology_checksum,
 )
 from sim_server.arrays import Float32, Float64
+from sim_server.backends.factors_together import FactorsTogether
 from sim_server.backends.shared_memory import SharedMemory
 from sim_server.network.leases import InFlightJob
 from sim_server.network.native_copies import native_copies

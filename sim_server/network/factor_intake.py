@@ -11,11 +11,11 @@ import zenoh
 
 from protocol.counters import Counters
 from protocol.factor import Factor
-from protocol.factors_together import FactorsTogether
 from protocol.messages_pb2 import Factor as FactorMessage
 from protocol.messages_pb2 import FactorBatch
 from protocol.refused import Refused
 from protocol.shared_memory.pool import Slot, SlotPool
+from sim_server.backends.factors_together import FactorsTogether
 from sim_server.network.bookkeeping import Bookkeeping
 from sim_server.network.factor_decoder import DecodedFactors
 from sim_server.network.factor_fetch import AHEAD, FactorFetch

@@ -244,9 +244,15 @@ class Leases:
 
     def _remember(self, job: InFlightJob, seconds: float) -> None:
         """Takes note of how long a factorization took, by which later leases go."""
-        self._seconds.setdefault(job.object, {})[job.worker] = seconds
-        self._answered.setdefault((job.object, job.worker), set()).add((job.method, job.positions))
-        self._doublings.pop((job.object, job.worker), None)
+        pair, answer = (job.object, job.worker), (job.method, job.positions)
+        if (known := self._seconds.get(job.object)) is None:
+            known = self._seconds[job.object] = {}
+        known[job.worker] = seconds
+        if (answered := self._answered.get(pair)) is None:
+            answered = self._answered[pair] = set()
+        answered.add(answer)
+        if self._doublings:
+            self._doublings.pop(pair, None)
 
     def expire(self, now: float, is_answered: Callable[[InFlightJob], bool] = lambda job: False) -> list[InFlightJob]:
         """Ends the leases that are over: objects and workers are free again, the slots are not. Returns the jobs.

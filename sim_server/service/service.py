@@ -148,8 +148,12 @@ class Service:
         """Returns True for an object that has run away and is frozen."""
         return name in self.driver.by_name and self.driver.by_name[name].frozen
 
-    def run(self) -> None:
-        """Blocks until the run is over; a KeyboardInterrupt ends the loop first and is then raised."""
+    def run(self, is_told_to_end: Callable[[], bool] = lambda: False) -> None:
+        """Blocks until the run is over.
+
+        is_told_to_end: looked at between rounds; what a round has taken from the loop is in the log then. An exception
+        in the middle of one, such as KeyboardInterrupt, ends the loop, too, and is then raised
+        """
         if not self.link.dispatch.workers():
             self._first = None  # nobody makes any
         loop = threading.Thread(target=self._loop, name="loop")
@@ -157,7 +161,7 @@ class Service:
             self._drain()  # asks for the matrices of the first step, and not of the one that is due dt later
         try:
             loop.start()  # inside: a signal may come before it returns, when the thread runs already
-            while loop.is_alive() and not self.commands.stopping:
+            while loop.is_alive() and not (self.commands.stopping or is_told_to_end()):
                 begin = time.monotonic()
                 self.round()
                 if self._between.waits and self._first is None:

@@ -19,11 +19,11 @@ from numpy.typing import NDArray
 
 from protocol.counters import Counters
 from protocol.factor import Factor
-from protocol.factors_together import FactorsTogether
 from protocol.method import Method
 from sim_server.arrays import Float64
 from sim_server.backends.base import Capability
 from sim_server.backends.cpu.structs import REACTION
+from sim_server.backends.factors_together import FactorsTogether
 from sim_server.mechanics.world import Body
 from sim_server.simulation import Simulation
 from sim_server.updates.body_state import BodyUpdateState, MadeFactors, on_checks, on_factors

@@ -8,21 +8,22 @@ all of it; a factor that takes off less than block Jacobi does is worth less tha
 
 import ctypes as c
 import threading
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import cache
+from itertools import repeat
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from protocol.factor import Factor, FactorPattern
-from protocol.factors_together import FactorsTogether
 from protocol.shared_memory.located import Located, address, addresses
 from protocol.validate import helping_threads
 from sim_server.arrays import Int32
 from sim_server.backends.compiler import native
 from sim_server.backends.cpu import structs
 from sim_server.backends.cpu.factors import NativePattern
+from sim_server.backends.factors_together import FactorsTogether
 from sim_server.updates.patterns import Patterns
 
 Reals = NDArray[np.float64]
@@ -80,9 +81,7 @@ class CheckedBody:
 class Checked(NamedTuple):
     """Factors that are checked, by columns. matrices: values (blocks, 3, 3) that each was made from; None: not known"""
 
-    objects: Sequence[str]
-    epochs: Sequence[int]
-    patterns: Sequence[FactorPattern]
+    bodies: Sequence[CheckedBody]
     values: Sequence[NDArray[Any]]
     matrices: Sequence[Reals | None]
 
@@ -135,8 +134,8 @@ class FactorCheck:
         sizes = [len(self._patterns.at(*each)[0]) - 1 for each in zip(factors.objects, factors.epochs, strict=True)]
         if any(3 * nodes != factors.pattern.size for nodes in sizes):
             return self.reject_reasons(list(zip(factors, matrices, strict=True)))
-        checked = Checked(factors.objects, factors.epochs, [factors.pattern] * len(factors), factors.values, matrices)
-        found = _probes(self._judge(checked, WITH_FACTOR | WITH_BLOCK_JACOBI))
+        bodies = self._known(factors.objects, factors.epochs, repeat(factors.pattern))
+        found = _probes(self._judge(Checked(bodies, factors.values, matrices), WITH_FACTOR | WITH_BLOCK_JACOBI))
         reasons = [""] * len(factors)
         for k in np.flatnonzero(self._may_be_useless(found)).tolist():
             reasons[k] = self._useless(factors[k], matrices[k], Probe(*found[k].tolist()))
@@ -197,7 +196,7 @@ class FactorCheck:
         factors, matrices = [factor for factor, _ in checked], [matrix for _, matrix in checked]
         objects, epochs = [f.object for f in factors], [f.epoch for f in factors]
         patterns, values = [f.pattern for f in factors], [f.values for f in factors]
-        given = Checked(objects, epochs, patterns, values, matrices)
+        given = Checked(self._known(objects, epochs, patterns), values, matrices)
         if applied is None:
             return _probes(self._judge(given, WITH_FACTOR | WITH_BLOCK_JACOBI))
         unread = given._replace(values=[NO_VALUES] * len(values))  # those on a device would be copied
@@ -212,9 +211,8 @@ class FactorCheck:
             return self._judge_locked(checked, parts, applied)
 
     def _judge_locked(self, checked: Checked, parts: int, applied: Reals | None) -> Reals:
-        objects, epochs, patterns, values, matrices = checked
-        count, values = len(objects), [_contiguous(each) for each in values]
-        bodies = [self._body(*each) for each in zip(objects, epochs, patterns, strict=True)]
+        bodies, values, matrices = checked
+        count, values = len(bodies), [_contiguous(each) for each in values]
         row_start, columns, r, pattern = np.array([body.addresses for body in bodies], np.uintp).T.copy()
         factors, nodes = np.zeros(count, FACTOR), np.array([body.nodes for body in bodies], np.int32)
         factors["pattern"], factors["values"] = pattern, addresses(values)
@@ -230,8 +228,14 @@ class FactorCheck:
         _library().wf_judge_all(count, parts, *map(address, arrays), room, threads)
         return out
 
+    def _known(
+        self, objects: Sequence[str], epochs: Sequence[int], patterns: Iterable[FactorPattern]
+    ) -> list[CheckedBody]:  # fmt: skip
+        """Returns what is known of the objects of some factors, which have their size."""
+        with self._lock:
+            return [self._body(*each) for each in zip(objects, epochs, patterns, strict=False)]
+
     def _body(self, name: str, epoch: int, pattern: FactorPattern) -> CheckedBody:
-        """Returns what is known of an object; while the lock is held."""
         row_start, columns = self._patterns.at(name, epoch)
         known = self._bodies.get(name)
         if known is None or not known.fits(row_start, columns, pattern):

@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from protocol.factor import Factor, FactorPattern
-from protocol.factors_together import FactorsTogether
 from protocol.method import Method
 from sim_server.arrays import Float64, Int32
+from sim_server.backends.factors_together import FactorsTogether
 from sim_server.updates.patterns import Patterns
 
 if TYPE_CHECKING:

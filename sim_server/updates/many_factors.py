@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from protocol.factors_together import FactorsTogether
 from sim_server.arrays import Float64
+from sim_server.backends.factors_together import FactorsTogether
 from sim_server.updates.body_state import BodyUpdateState, MadeFactors, on_checks, on_factors
 from sim_server.updates.factor_source import Check
 from sim_server.updates.update_table import NONE
@@ -50,8 +50,16 @@ class ManyFactors:
         return [own is not None and own[0] == step for own, step in zip(sent, factors.steps, strict=True)]
 
     def _checked(self, matrices: Mapping[str, Float64], factors: FactorsTogether) -> list[str]:
-        driver, own = self._driver, [matrices[name] for name in factors.objects]
-        return driver.reasons(len(factors), driver.check.reject_together, factors, own)
+        return self._driver.reasons(len(factors), self._judged, matrices, factors)
+
+    def _judged(self, matrices: Mapping[str, Float64], factors: FactorsTogether) -> list[str]:
+        """Checks factors, and has those that are good made ready for use."""
+        driver = self._driver
+        reasons = driver.check.reject_together(factors, [matrices[name] for name in factors.objects])
+        good = factors if not any(reasons) else factors.of([k for k, why in enumerate(reasons) if not why])
+        if len(good) >= MANY:
+            driver.engine.prepare_together([driver.by_name[name].body.index for name in good.objects], good)
+        return reasons
 
     def adopt(self, factors: FactorsTogether) -> None:
         """Gives the loop factors that were checked, or begins to check them beside the caller. Few that were not, and
@@ -95,6 +103,9 @@ class ManyFactors:
         made = MadeFactors(factors.steps, factors.seconds, workers, regularized)
         newer = on_factors(states, driver.table, made, driver.engine.step)
         if not all(newer):
+            for state, factor, better in zip(states, factors, newer, strict=True):
+                if not better:
+                    driver.engine.drop_factor(state.body.index, factor)
             chosen = [k for k, better in enumerate(newer) if better]
             factors, states = factors.of(chosen), [states[k] for k in chosen]
         if states:

@@ -43,7 +43,7 @@ class PrefetchDepth:
         return True
 
     def on_copy(self, seconds: float) -> None:
-        """Takes note of a copy that is there so many seconds after its request."""
+        """Takes note of copies that are there so many seconds after their requests, in the mean."""
         self._copy.add(seconds)
 
     def on_sent(self, count: int, now: float) -> None:

@@ -40,8 +40,12 @@ class Array(np.ndarray):
     def data(self) -> Any:  # type: ignore[override]
         return SimpleNamespace(ptr=self.ctypes.data)
 
-    def get(self, stream: Any = None) -> np.ndarray:
-        return np.array(self)
+    def get(self, stream: Any = None, out: np.ndarray | None = None) -> np.ndarray:
+        if out is None:
+            return np.array(self)
+        assert out.shape == self.shape and out.dtype == self.dtype
+        out[...] = self
+        return out
 
     def set(self, values: np.ndarray) -> None:
         self[...] = values

@@ -67,13 +67,23 @@ static float unit_for(double) { return 1; }
 static int first_bad_node(const PcgBody&, const real*, int&) { return -1; }
 struct ResidualSource { const FlagWord<float>* r; unsigned r_number, q_number; float alpha; };
 static float shared_vector[2048];
+constexpr int PADDING = 32;
+#ifndef LENT
+#define LENT 0
+#endif
 struct PartitionedInverse {
+    Arena lent;  // LENT bytes that nobody else needs between two applications
+
     const float *scale, *matrix;
     FlagWord<float> *residual, *product, *z;
     uint4* kept;
     int size, phases, near, first, last;  // own rows
     const DevicePlan* plan;
-    void reserve(const DevicePlan* shared_plan, int, Arena&) { plan = shared_plan; }
+    void reserve(const DevicePlan* shared_plan, int, Arena& arena) {
+        plan = shared_plan;
+        lent = {arena.next, arena.next + LENT};
+        arena.next += LENT;
+    }
     void set_up(const PcgBody& body, int index, Arena& arena) {
         size = plan->size; first = index * size / body.blocks; last = (index + 1) * size / body.blocks;
         phases = 1; scale = body.scale; matrix = (const float*)body.matrix;
@@ -90,6 +100,7 @@ struct PartitionedInverse {
         for (int k = threadIdx.x; k < 128 * near; k += THREADS) ((int*)kept)[k] = 7;
     }
     void gather(int, const ResidualSource& from, unsigned, float) const {
+        for (char* at = lent.next + threadIdx.x; at < lent.end; at += THREADS) *at = 0x7f;
         for (int k = threadIdx.x; k < 128 * near; k += THREADS)
             if (((int*)kept)[k] != 7) std::abort();  // not fetched again
         for (int k = threadIdx.x; k < size; k += THREADS) {

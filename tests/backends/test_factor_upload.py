@@ -673,6 +673,78 @@ def test_what_fails_while_they_are_posted_is_told_to_who_serves_the_loop(many, m
     assert [box.posted for box in boxes] == values and module.post_all is post
 
 
+def given(boxes: list[Mailbox], step: int) -> list[tuple[int, Any, np.ndarray, int]]:
+    return [(body, PATTERN, np.array([step + body]), step + body) for body in range(len(boxes))]
+
+
+@pytest.mark.parametrize("early", [True, False], ids=["posted before they are built", "after"])
+def test_many_that_were_prepared_are_built_once_and_used_when_they_are_posted(many, early):
+    maker, upload, boxes = many
+    go, build = threading.Event(), maker.build_many
+
+    def slow(*arguments: Any) -> list[PartitionedInverse]:
+        assert go.wait(30)
+        return build(*arguments)
+
+    maker.build_many = slow
+    factors = given(boxes, 10)
+    upload.prepare_many(factors)
+    if early:
+        upload.post_many(factors)
+    go.set()
+    maker.thread.submit(lambda: None).result()
+    upload.advance()
+    if not early:
+        assert [box.posted for box in boxes] == [0] * len(boxes), "nobody has posted them"
+        upload.post_many(factors)
+    assert [box.posted for box in boxes] == [step for *_, step in factors] and len(maker.storages) == len(boxes)
+
+
+def test_of_many_that_were_prepared_what_is_dropped_or_replaced_is_not_used(many):
+    maker, upload, boxes = many
+    first, second = given(boxes, 10), given(boxes, 20)
+    upload.prepare_many(first)
+    maker.thread.submit(lambda: None).result()
+    for body, _, values, _ in first[:2]:
+        upload.drop(body, values)
+    upload.post_many(second[1:])  # those of the others are replaced, as their factors were never posted
+    maker.thread.submit(lambda: None).result()
+    upload.advance()
+    assert [box.posted for box in boxes] == [0, *(20 + body for body in range(1, len(boxes)))]
+    upload.post_many(second[:1])
+    assert boxes[0].posted == 20
+
+
+def test_a_factor_that_is_never_posted_holds_up_none_after_it(many):
+    """It is being built when the next one comes, which waits until then."""
+    maker, upload, boxes = many
+    go, build = threading.Event(), maker.build_many
+
+    def slow(*arguments: Any) -> list[PartitionedInverse]:
+        assert go.wait(30)
+        return build(*arguments)
+
+    maker.build_many = slow
+    upload.prepare_many(given(boxes, 10))
+    upload.prepare_many(given(boxes, 15))  # one comes already
+    upload.post_many(given(boxes, 20))
+    go.set()
+    for _ in range(3):
+        maker.thread.submit(lambda: None).result()
+        upload.advance()
+    assert [box.posted for box in boxes] == [20 + body for body in range(len(boxes))]
+
+
+def test_few_are_not_prepared(many):
+    maker, upload, boxes = many
+    upload.prepare_many(given(boxes, 10)[:-2])
+    maker.thread.submit(lambda: None).result()
+    assert maker.storages == []
+    post_all(upload, [7] * len(boxes))
+    maker.thread.submit(lambda: None).result()
+    assert [box.posted for box in boxes] == [7] * len(boxes)
+
+
 def test_of_several_of_one_body_among_many_the_last_one_is_used(many):
     maker, upload, boxes = many
     given = [*range(len(boxes)), 0]

@@ -689,6 +689,18 @@ def test_parameters_are_copied_between_batches_all_together() -> None:
         scene.loop.run(1)
 
 
+def test_a_batch_has_several_steps_where_these_are_short():
+    """What is requested and posted waits for two batches."""
+    batches = []
+    for seconds in (1e-12, 1.0):
+        scene = FakeScene()
+        scene.loop.loop.batch_seconds = seconds
+        scene.loop.run(40)
+        assert scene.loop.records()["step"].tolist() == list(range(1, 41))
+        batches.append(int(scene.loop.loop.begun))
+    assert batches[0] == 40 and batches[1] < 10
+
+
 def test_a_matrix_in_the_memory_of_the_loop_is_not_copied_once_more():
     """A request with other memory is served as ever; each leaves alone the matrix of the request before."""
     scene = FakeScene(bodies=3)

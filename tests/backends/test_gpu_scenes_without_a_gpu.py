@@ -2,12 +2,15 @@
 """Scenes are built for a GPU where there is none: texts compile with the options of a run, and launches fit kernels."""
 
 import ctypes as c
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from precond_worker.factorization.factorize import Analysis
+from sim_server.backends import compiler
 from sim_server.backends.gpu import device
+from sim_server.backends.gpu.inverse import digits, partition
 from sim_server.backends.gpu.inverse.build_inverse import InverseBuilder
 from sim_server.backends.gpu.inverse.plan import plan
 from sim_server.backends.gpu.islands import OWN_SURFACES
@@ -492,3 +495,17 @@ def test_an_effect_of_another_package_is_put_together_with_the_others(cupy, tmp_
     assert "trap.pull" in [launch.name for launch in simulation.step_launches]
     assert any("::pull_item(" in code and "::gather" in code and "trap_law.cuh" in code for code in sources)
     assert len(build_id(simulation)) == 24
+
+
+def test_the_build_does_not_depend_on_when_texts_of_factors_are_loaded(monkeypatch):
+    """A server whose pattern of L is known loads them before it writes its log, others later."""
+    monkeypatch.setattr(compiler, "libraries", set())
+    simulation = Simulation.load("deploy/scenes/beam.toml", [], "gpu")
+    before = build_id(simulation)
+    for module in (digits, partition):
+        module.library.cache_clear()
+        module.library()
+    assert build_id(simulation) == before
+    assert {Path(text).name for text in device.LATER} <= set(compiler.compiled)
+    monkeypatch.setattr(device, "LATER", device.LATER[:1])
+    assert build_id(simulation) != before

@@ -54,7 +54,7 @@ def falling(device: str, cells: tuple[int, int, int] = CELLS) -> tuple[Simulatio
 
 def slow_factor(sim: Simulation) -> int | None:
     """Step of the factor with which a solve was slow last; None where none goes on smoothed."""
-    return next((int(a.read()[0]) for a in sim.engine.state() if a.name == "engine.smoothing.slow"), None)
+    return next((int(a.read()[0]) // 2 for a in sim.engine.state() if a.name == "engine.smoothing.slow"), None)
 
 
 def test_slow_solves_go_on_with_fewer_iterations_and_repeat_to_the_bit():

@@ -20,6 +20,7 @@ from protocol.shared_memory.view import SlotMap
 from protocol.validate import checksum
 from sim_server.network import factor_decoder, factor_intake, job_sender, worker_choice
 from sim_server.network.batch_message import MOST_TOGETHER
+from sim_server.network.job_sender import JobSender
 from sim_server.network.link import ServerLink
 from sim_server.network.send_queue import SendQueue
 from sim_server.network.worker_timing import WorkerTiming
@@ -157,6 +158,33 @@ def test_answers_may_come_in_parts_and_in_any_order(stage: Hand) -> None:
     stage.driver.until(lambda: all_are_back(stage), "the others")
     stage.check_factors()
     assert stage.driver.link.slots_lent == 0
+
+
+def test_jobs_that_are_looked_up_at_once_travel_as_those_looked_up_one_by_one(
+    stage: Hand, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    found, real, used, senders = [], JobSender.alike, [], set()
+
+    def alike(sender: JobSender, given: Any) -> Any:
+        senders.add(sender)
+        used.append(real(sender, given))
+        return used[-1] if found else None
+
+    for name in NAMES:
+        stage.driver.link.dispatch.factor_helped("hand", name)  # what failed in other tests is forgotten
+    monkeypatch.setattr(JobSender, "alike", alike)
+    for _ in range(2):
+        batch = stage.batch()
+        found.append({name: list(getattr(batch, name)) for name in ("objects", "epochs", "warps", "blocks", "rooms")})
+        stage.send(stage.answer(batch))
+        stage.driver.until(lambda: stage.made() == set(NAMES), "their factors")
+    assert found[0] == found[1] and None not in used and len(used) == 2
+    (sender,), flying = senders, stage.batch(("a", "b"))
+    assert real(sender, jobs(950, ("b", "c"))) is None, "one has a job in flight"
+    assert real(sender, [*jobs(950, ("c",)), *jobs(951, ("c",))]) is None, "twice the same"
+    assert real(sender, [*jobs(950, ("c",)), *jobs(950, ("d",), dtype="float64")]) is None
+    stage.send(stage.answer(flying))
+    stage.driver.until(lambda: stage.made() == {"a", "b"}, "their factors")
 
 
 def test_an_object_alone_goes_as_ever(stage: Hand) -> None:

@@ -10,9 +10,11 @@ import numpy as np
 import pytest
 
 from protocol.factor import Factor
-from protocol.factors_together import FactorsTogether
+from protocol.method import Method
+from sim_server.backends.factors_together import FactorsTogether
 from sim_server.simulation import Simulation
 from sim_server.updates.driver import Driver
+from sim_server.updates.factor_check import FactorCheck
 from sim_server.updates.factor_source import FactorSource, Job
 from sim_server.updates.many_factors import MANY
 from sim_server.updates.update_table import NONE
@@ -79,7 +81,7 @@ def in_flight(driver: Driver, body: int) -> None:
     driver.engine.assemble()
     values = np.array(driver.simulation.system.body_values(b.first, b.last))
     driver.engine.solve()
-    state.on_job(step, driver._method)
+    state.on_job(step, Method())
     state.job.set_copy(values)
     state.on_sent(step)
 
@@ -187,6 +189,32 @@ def test_those_that_were_checked_as_they_came_are_used_at_once_however_few():
     assert driver.bodies[0].job.matrix is None and any(memory is each for each in driver.snapshots.free[memory.shape])
 
 
+def test_those_that_are_good_are_made_ready_where_they_are_checked_and_dropped_if_they_are_not_used(monkeypatch):
+    driver, source = start()
+    prepared: list[tuple[int, int]] = []
+    dropped: list[tuple[int, int]] = []
+    monkeypatch.setattr(
+        driver.engine, "prepare_together", lambda bodies, own: prepared.extend(zip(bodies, own.steps, strict=True))
+    )
+    monkeypatch.setattr(driver.engine, "drop_factor", lambda body, factor: dropped.append((body, factor.step)))
+    source.together = [factors := checked_as_they_come(source, spoilt(made(driver), [2]))]
+    own = list(enumerate(factors.steps))
+    assert prepared == [each for each in own if each[0] != 2]
+    source.over = {"bar5"}
+    checked(driver)
+    assert sorted(dropped) == [own[2], own[5]] and driver.table.used.tolist() == [
+        int(k not in (2, 5)) for k in range(BODIES)
+    ]
+    for body in range(BODIES):
+        in_flight(driver, body)
+    dropped.clear()
+    later = made(driver)
+    monkeypatch.setattr(driver.table, "on_factors", lambda bodies, *_: [body != 7 for body in bodies.tolist()])
+    source.over, source.together = set(), [checked_as_they_come(source, later)]
+    checked(driver)
+    assert dropped == [(7, later.steps[7])]
+
+
 def test_a_verdict_on_a_matrix_that_is_not_there_any_more_counts_for_nothing(monkeypatch):
     """Its memory may have been written to while it was checked: each of them is checked again, without it."""
     driver, source = start()
@@ -256,10 +284,12 @@ def test_each_of_them_is_judged_as_if_it_came_alone():
     factors = spoilt(made(driver), [1, 6])
     matrices = [state.job.matrix[1] for state in driver.bodies]
     matrices[2] = None
-    check = driver.check
+    sim = driver.simulation
+    patterns = {b.name: sim.system.body_pattern(b.first, b.last) for b in sim.world.bodies}
+    check = FactorCheck(patterns)
     alone = [check.reject_reasons([each])[0] for each in zip(factors, matrices, strict=True)]
     assert check.reject_together(factors, matrices) == alone and [bool(a) for a in alone].count(True) == 2
-    check._patterns._given["bar3"] = driver.simulation.system.body_pattern(0, 4)
+    patterns["bar3"] = sim.system.body_pattern(0, sim.world.bodies[1].last)
     told = check.reject_together(factors, matrices)
     assert told[3].startswith("its size is") and told[:3] + told[4:] == alone[:3] + alone[4:]
 

@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from protocol.factor import Factor, FactorPattern
-from protocol.factors_together import FactorsTogether
 from sim_server.arrays import Float64, Int32, Int64
 from sim_server.backends.base import ArrayChange, Capability, Due, EngineInput, Launch
 from sim_server.backends.cpu import structs
@@ -28,6 +27,7 @@ from sim_server.backends.cpu.library import loop_library
 from sim_server.backends.cpu.newton import NativeNewton
 from sim_server.backends.cpu.processors import usable_threads
 from sim_server.backends.cpu.schemes import NativeEuler, NativeStages, NativeSubsteps, tell_bodies_apart
+from sim_server.backends.factors_together import FactorsTogether
 from sim_server.backends.rank_one import RankOne
 from sim_server.backends.ring_buffers import Reports
 from sim_server.backends.state import StateArray, host_array
@@ -309,6 +309,9 @@ class CpuEngine(Reports):
             buffer = self._mail[body].free_buffer(factor.pattern, factor.values.dtype)
             buffer.take(factor.values, factor.step)
             self._mail[body].post(buffer)
+
+    def prepare_together(self, bodies: Sequence[int], factors: FactorsTogether) -> None:
+        """Does nothing: factors are applied as they come."""
 
     def post_together(self, bodies: Sequence[int], factors: FactorsTogether) -> None:
         """Posts factors that came together, as `post_factors`."""

@@ -27,8 +27,8 @@ class DeviceArray(Protocol):
 
     def __setitem__(self, index: Any, value: Any) -> None: ...
 
-    def get(self, stream: "Stream | None" = None) -> NDArray[Any]:
-        """Copies the array to the host."""
+    def get(self, stream: "Stream | None" = None, *, out: NDArray[Any] | None = None) -> NDArray[Any]:
+        """Copies the array to the host. out: to where; None: a new array"""
         ...
 
     def set(self, array: NDArray[Any]) -> None:

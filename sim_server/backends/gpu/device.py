@@ -20,12 +20,14 @@ from numpy.typing import NDArray
 from protocol.process.nvidia import NoGpu, usable_cupy
 from sim_server.backends.base import Engine, EngineInput
 from sim_server.backends.build_pool import CompileError, compilers
-from sim_server.backends.compiler import INCLUDE, SOURCES, ahead, build_id
+from sim_server.backends.compiler import INCLUDE, SOURCES, ahead, build_id, names
 from sim_server.backends.gpu.cupy_types import DeviceArray, KernelFunction, KernelModule
 from sim_server.backends.kernel_binding import BoundKernel, KernelText, structure_of
 from sim_server.errors import DeviceError
 
 CAPABILITY = 80  # compute capability times 10; the solver needs matrix instructions of float16
+# Texts that are loaded with the first factor, or before it where its pattern is known: all runs count them as used
+LATER = ("backends/gpu/inverse/digits.cpp", "backends/gpu/inverse/tree_cuts.cpp")
 MAILED_THREADS = 4096  # of a launch whose number of items may change
 
 
@@ -280,7 +282,13 @@ class Gpu:
     def build(self) -> str:
         """Returns a digest of code, device and CUDA; runs of a scene with equal ones agree bit for bit."""
         runtime = self.cp.cuda.runtime.runtimeGetVersion()
-        parts = [build_id(), digest(".cu", ".cuh", ".h"), self.properties["name"].decode(), str(runtime)]
+        parts = [
+            build_id(),
+            *names(*LATER),
+            digest(".cu", ".cuh", ".h"),
+            self.properties["name"].decode(),
+            str(runtime),
+        ]
         outside = [module for module in self._modules.values() if module.folder is not None]
         parts += sorted(module.text + " ".join(folder_options(module.folder)[1:]) for module in outside)
         return hashlib.sha256("\0".join(parts).encode()).hexdigest()[:24]

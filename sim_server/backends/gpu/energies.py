@@ -18,6 +18,7 @@ from sim_server.backends.gpu.cupy_types import DeviceArray, KernelFunction
 from sim_server.backends.gpu.device import DeviceLaunch, Gpu, compiled, options, own_headers
 from sim_server.backends.gpu.kernel_fusion import Prologue
 from sim_server.backends.gpu.mailbox import library
+from sim_server.backends.gpu.pinned import pinned_array
 from sim_server.backends.gpu.state import device_arrays
 from sim_server.backends.state import StateArray
 
@@ -154,7 +155,7 @@ class DeviceEnergies:
         e = self._energies
         self.launch_elastic()
         self._settled[:] = self._counter
-        x, v = (self._gpu.twin(array).get() for array in (e.x, e.v))
+        x, v = (self._on_host(self._gpu.twin(array)) for array in (e.x, e.v))
         balance = np.frombuffer(self._balance.get().tobytes(), BALANCE).copy()
         starts = np.arange(len(balance)) if bodies is None else np.array(bodies, np.int64)
         balance["elastic"][starts] = self._sum.get()[starts]
@@ -163,6 +164,12 @@ class DeviceEnergies:
         start_balances(balance, starts, e, x, v, self._dt)
         self._balance.set(np.frombuffer(balance.tobytes(), np.uint8))
         self.started = True
+
+    def _on_host(self, twin: DeviceArray) -> NDArray[Any]:
+        """Copies an array to page-locked memory, which is used again: the pages of other memory take longer to come
+        than the values of a thousand bodies."""
+        host = pinned_array(self._gpu.cp, twin.size, twin.dtype).reshape(twin.shape)
+        return twin.get(out=host)
 
 
 def types_of_energies(types: dict[str, str], energy: np.dtype) -> dict[str, str]:

@@ -18,15 +18,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from protocol.factor import Factor, FactorPattern
-from protocol.factors_together import FactorsTogether
 from sim_server.arrays import Float64
 from sim_server.backends.base import ArrayChange, Capability, EngineInput, Launch
 from sim_server.backends.cpu.structs import REACTION
+from sim_server.backends.factors_together import FactorsTogether
 from sim_server.backends.gpu.central_difference import ESTIMATE_EVERY
 from sim_server.backends.gpu.cuda import CudaDevice
 from sim_server.backends.gpu.cupy_types import Graph
 from sim_server.backends.gpu.device import DeviceLaunch, Gpu
-from sim_server.backends.gpu.factor_upload import FactorUpload
+from sim_server.backends.gpu.factor_upload import FactorUpload, Given
 from sim_server.backends.gpu.helper import alone
 from sim_server.backends.gpu.host_results import HostResults
 from sim_server.backends.gpu.known_patterns import KnownPatterns
@@ -259,10 +259,13 @@ class GpuEngine(DeviceLoop):
             [(body, f.pattern, f.values, f.step) for body, f in zip(bodies, factors, strict=True)]
         )
 
+    def prepare_together(self, bodies: Sequence[int], factors: FactorsTogether) -> None:
+        """Begins to build the inverses of factors, beside steps and caller."""
+        self._factor_upload.prepare_many(_given(bodies, factors))
+
     def post_together(self, bodies: Sequence[int], factors: FactorsTogether) -> None:
         """Posts factors that came together, as `post_factors`."""
-        pattern = repeat(factors.pattern, len(bodies))
-        self._factor_upload.post_many(list(zip(bodies, pattern, factors.values, factors.steps, strict=True)))
+        self._factor_upload.post_many(_given(bodies, factors))
 
     def prepare_for_factors(self) -> None:
         """Has the kernels that build inverses of factors compiled beside the caller, and the inverses planned whose
@@ -416,3 +419,8 @@ class GpuEngine(DeviceLoop):
         if self._ties and self._broken is not None:
             self._ties.broken[:] = self._broken
         return super().records_and_reactions()
+
+
+def _given(bodies: Sequence[int], factors: FactorsTogether) -> list[Given]:
+    """Returns factors as their inverses are built."""
+    return list(zip(bodies, repeat(factors.pattern, len(bodies)), factors.values, factors.steps, strict=True))

@@ -98,6 +98,8 @@ class GivenFactor:
         _tell(self.applied, applied)
 
 
+Given = tuple[int, FactorPattern, NDArray[Any] | DeviceValues, int]
+"""A body, and of its factor pattern, values and step."""
 Work = tuple[int, GivenFactor, Mapping[InverseKind, InverseStorage]]
 """A body, its factor, and by kind a storage that no step reads, if there is one."""
 
@@ -290,17 +292,38 @@ class FactorUpload:
         if uploads.built is not None:
             uploads.built[1].drop()
             uploads.built = None
+        if uploads.building is not None and not (built := uploads.building.given[body]).wanted:
+            built.dropped = True  # unless it is posted: who waits for it is told
         uploads.queued = given
 
-    def post_many(self, given: Sequence[tuple[int, FactorPattern, NDArray[Any] | DeviceValues, int]]) -> None:
+    def prepare_many(self, given: Sequence[Given]) -> None:
+        """Begins to build the inverses of factors of different bodies, beside the caller; each is used once these very
+        values are posted. A body that has a factor coming is left out."""
+        with self._lock:
+            chosen = [each for each in given if not self._uploads[each[0]].comes]
+            if len(chosen) >= MANY:
+                for body, pattern, values, step in chosen:
+                    self._enqueue(body, GivenFactor(pattern, values, step, wanted=False))
+                self._begin_queued([each[0] for each in chosen])
+
+    def post_many(self, given: Sequence[Given]) -> None:
         """Takes factors, each as `post` takes one; of several of a body the last one counts. Inverses of many are built
         beside the caller, who would wait for one after another, those of one plan together."""
         with self._lock:
             waiting: dict[int, None] = {}  # in this order
+            built: list[tuple[int, GivenFactor, UploadedFactor | Exception]] = []
             for body, pattern, values, step in given:
-                if not (self._uploads[body].comes and self._use_prepared(body, values)):
+                uploads = self._uploads[body]
+                prepared = self._prepared(body, values) if uploads.comes else None
+                if prepared is None:
                     self._enqueue(body, GivenFactor(pattern, values, step))
                     waiting[body] = None
+                    continue
+                prepared.wanted = True
+                if uploads.built is not None and uploads.built[1] is prepared:
+                    built.append((body, prepared, uploads.built[0]))
+                    uploads.built = None
+            self._post_all(built)
             self._begin_queued([*self._waiting, *(body for body in waiting if body not in self._waiting)])
 
     def advance(self) -> None:

@@ -138,7 +138,7 @@ struct PcgSolver {
 #endif
         if (inverted) inverse.reserve(&memory.plan, group.index, arena);
         BlockRows rows;
-        rows.set_up(s, body, range, arena, inverted);
+        rows.set_up(s, body, range, arena, inverted, inverted ? inverse.lent : Arena{nullptr, nullptr});
         real* diagonal = arena.take<real>(9 * rows.own);
         if (!diagonal) diagonal = s.diagonal + 9ll * (body.first + rows.begin);
         if (inverted) inverse.set_up(body, group.index, arena);
@@ -770,6 +770,18 @@ struct PcgSolver {
         group.barrier();
     }
 
+#ifdef SMOOTHED
+    // Leaves a solve before its first iteration to smoothed.cu, with r where that finds it. from_start: x is that of the scene, else zero.
+    __device__ __forceinline__ void leave(bool from_start, double r2) {
+        const BlockRows& rows = memory.rows;
+        real* r = s.own_vectors + 3ll * (memory.body.first + rows.begin) + 3ll * s.nodes;
+        for (int k = threadIdx.x; k < 3 * rows.own; k += THREADS) r[k] = rows.r[k] - (from_start ? rows.q[k] : 0);
+        if (!from_start) give(0, 0);
+        memory.out.status = SLOW;
+        memory.out.residual = sqrt(r2 / memory.b2);
+    }
+#endif
+
     // Continues with another preconditioner from the present residual.
     __device__ __forceinline__ void change(int kind) {
         group.barrier();
@@ -908,7 +920,13 @@ __device__ __forceinline__ void PcgSolver::solve() {
 #else
         constexpr bool alone = true;
 #endif
-        if (stop < 0 && iterations == memory.limit && kind == CHOLESKY && alone && is_slow(iterations, memory.first_r2, r2, memory.goal)) stop = SLOW;
+        if (stop < 0 && iterations == memory.limit && kind == CHOLESKY && alone && is_slow(body.nodes, iterations, memory.first_r2, r2, memory.goal)) {
+            stop = SLOW;
+            if (iterations == 0) {
+                leave(alpha != 0, r2);
+                return;
+            }
+        }
 #endif
         if (stop < 0) {
 #ifdef CORRECTED

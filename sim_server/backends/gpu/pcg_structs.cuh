@@ -111,4 +111,5 @@ struct PcgArguments {
     int nodes, shared;             // of the scene; bytes of dynamic shared memory
     long long* slow;               // -DSMOOTHED: (bodies,) what solves leave to later ones (smoothing_state.cuh)
     long long* unfinished;         // likewise: (1,) step of the last solve that goes on smoothed
+    double* largest;               // likewise: (bodies,) estimate of the largest eigenvalue of D^-1 A, D its diagonal blocks; 0: none yet
 };

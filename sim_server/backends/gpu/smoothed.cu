@@ -24,8 +24,12 @@ __device__ __forceinline__ bool usable(double a) { return a > 0 && a < 1e300; }
 
 struct SmoothedSolver {
     BlockGroup group;
-    const real* b;  // (own, 3)
-    real* y;        // (own, 3) in: start; then p; out: solution
+    const real* b;        // (own, 3)
+    real* y;              // (own, 3) in: start; then p; out: solution
+    const real* residual; // (own, 3) of the start, or null
+    int sweeps;
+    double largest;       // eigenvalue of D^-1 A, 0: not known yet
+    SweepWeights weights = {};
     int way = SMOOTHED_FACTOR;
 
     static __device__ __forceinline__ double warp_sum(double mine) {
@@ -45,7 +49,7 @@ struct SmoothedSolver {
         PartitionedInverse inverse;
         inverse.reserve(&memory.plan, group.index, arena);
         BlockRows rows;
-        rows.set_up(s, body, range, arena, true);
+        rows.set_up(s, body, range, arena, true, inverse.lent);
         real* diagonal = arena.take<real>(9 * rows.own);
         if (!diagonal) diagonal = s.diagonal + 9ll * (body.first + rows.begin);
         inverse.set_up(body, group.index, arena);
@@ -92,39 +96,91 @@ struct SmoothedSolver {
     // rows.x = y, rows.r = b - A y; returns |r|^2.
     __device__ __forceinline__ double start() {
         const BlockRows rows = memory.rows;
-        group.barrier();  // y is complete
-        const real* all = y - 3 * rows.begin;
-        for (int k = threadIdx.x; k < 3 * rows.halo; k += THREADS) rows.values[k] = __ldcg(all + 3 * rows.nodes[k / 3] + k % 3);
-        __syncthreads();
-        multiply();
+        if (!residual) {
+            group.barrier();  // y is complete
+            const real* all = y - 3 * rows.begin;
+            for (int k = threadIdx.x; k < 3 * rows.halo; k += THREADS) rows.values[k] = __ldcg(all + 3 * rows.nodes[k / 3] + k % 3);
+            __syncthreads();
+            multiply();
+        }
         double mine = 0;
         for (int k = threadIdx.x; k < 3 * rows.own; k += THREADS) {
-            const real r = b[k] - rows.q[k];
-            rows.x[k] = rows.values[k];
+            const real r = residual ? residual[k] : b[k] - rows.q[k];
+            rows.x[k] = residual ? y[k] : rows.values[k];
             rows.r[k] = r;
             mine += (double)r * (double)r;
         }
+        residual = nullptr;
         return sum(mine);
+    }
+
+    // Estimates the largest eigenvalue of D^-1 A by the power method from signs of their own for all degrees of freedom, always the same.
+    __device__ __forceinline__ double largest_eigenvalue() {
+        const BlockRows rows = memory.rows;
+        double size2 = 0;
+        for (int step = 0; step <= POWER_STEPS; ++step) {
+            const real unit = size2 > 0 ? (real)(1 / sqrt(size2)) : 1;
+            for (int k = threadIdx.x; k < 3 * rows.own; k += THREADS) {
+                const int at = position(k);
+                const real v = step > 0 ? unit * by_diagonal(rows.q, k) : ((unsigned)at * 2654435761u >> 16 & 1) ? 1 : -1;
+                memory.inverse.product[at].put((float)v, group.number);
+            }
+            receive(memory.inverse.product, 0);
+            multiply();
+            double mine = 0;
+            for (int k = threadIdx.x; k < 3 * rows.own; k += THREADS) {
+                const real w = by_diagonal(rows.q, k);
+                mine += (double)w * (double)w;
+            }
+            size2 = sum(mine);
+        }
+        return POWER_MARGIN * sqrt(size2);
+    }
+
+    // What sweep `n` adds to entry k, q being A times what is there, or nothing being there. before: what the first one has added
+    __device__ __forceinline__ real sweep(int n, int k, real before, bool from_zero) const {
+        const real *r = memory.rows.r + k / 3 * 3, *q = memory.rows.q + k / 3 * 3, *v = memory.diagonal + 3 * k;
+        real update = v[0] * r[0] + v[1] * r[1] + v[2] * r[2];
+        if (!from_zero) update -= v[0] * q[0] + v[1] * q[1] + v[2] * q[2];
+        return n == 0 ? (real)weights.first * update : (real)weights.second * update + (real)weights.before * before;
     }
 
     // rows.values = P^-1 r, at the own nodes; returns z . r. r2: |r|^2.
     __device__ __forceinline__ double precondition(double r2) {
         const BlockRows rows = memory.rows;
-        const real weight = way == SMOOTHED_FACTOR ? (real)SMOOTH_WEIGHT : way == FACTOR ? 0 : 1;
+        const PartitionedInverse& inverse = memory.inverse;
+        FlagWord<float>* const other = inverse.residual + inverse.size + PADDING;
+        const bool smooth = way == SMOOTHED_FACTOR;
         for (int k = threadIdx.x; k < 3 * rows.own; k += THREADS)
-            memory.inverse.product[position(k)].put((float)(weight * by_diagonal(rows.r, k)), group.number);
-        receive(memory.inverse.product, 0);
+            inverse.product[position(k)].put(smooth ? (float)sweep(0, k, 0, true) : way == FACTOR ? 0 : (float)by_diagonal(rows.r, k), group.number);
+        receive(inverse.product, 0);
+        if (smooth && sweeps > 1) {
+            multiply();
+            for (int k = threadIdx.x; k < 3 * rows.own; k += THREADS) other[position(k)].put((float)sweep(1, k, rows.values[k], false), group.number);
+            receive(other, 1);
+        }
         if (way != DIAGONAL) {
             multiply();
             apply_inverse(r2);
-            receive(memory.inverse.z, 1);
+            receive(inverse.z, 1);
+        }
+        if (smooth) {
             multiply();
-            for (int k = threadIdx.x; k < 3 * rows.own; k += THREADS) rows.q[k] = rows.r[k] - rows.q[k];
-            __syncthreads();
+            if (sweeps > 1) {
+                group.number += 2;  // its words are written again; sums go on in turns
+                for (int k = threadIdx.x; k < 3 * rows.own; k += THREADS) inverse.product[position(k)].put((float)sweep(0, k, 0, false), group.number);
+                receive(inverse.product, 1);
+                multiply();
+            }
         }
         double mine = 0;
         for (int k = threadIdx.x; k < 3 * rows.own; k += THREADS) {
-            const real z = rows.values[k] + (way == SMOOTHED_FACTOR ? weight * by_diagonal(rows.q, k) : 0);
+            real z = rows.values[k];
+            if (smooth) {
+                float before = 0;
+                if (sweeps > 1) inverse.product[position(k)].get(before, group.number);
+                z += sweep(sweeps - 1, k, before, false);
+            }
             rows.values[k] = z;
             mine += (double)z * (double)rows.r[k];
         }
@@ -190,6 +246,8 @@ struct SmoothedSolver {
             if (last == 1e300) {
                 b2 = r2 / (out.residual * out.residual);
                 goal = memory.body.tolerance * memory.body.tolerance * b2;
+                if (!(largest > 0)) largest = largest_eigenvalue();
+                weights = SweepWeights::of(largest);
             }
             if (status < 0 && r2 <= goal) status = CONVERGED;
             if (status < 0 && !(r2 < 0.25 * last)) status = MAX_ITERATIONS;  // rounding errors dominate
@@ -239,7 +297,8 @@ extern "C" __global__ void __launch_bounds__(THREADS, PER_PROCESSOR) smoothed(co
     const long long first = 3ll * (memory.body.first + range.begin);
     SmoothedSolver solver = {{range.index, memory.body.blocks, s.exchange_number[k], s.block_sums + 8ll * s.grid * k, s.grid, memory.scratch, memory.totals,
                               (int)threadIdx.x % 32, (int)threadIdx.x / 32},
-                             s.b + first, s.y + first};
+                             s.b + first, s.y + first, result.iterations > 0 ? nullptr : s.own_vectors + first + 3ll * s.nodes,
+                             smoothing_sweeps(memory.body, s.slow[k]), s.largest[k]};
     solver.set_up(s, range);
     PcgResult out = result;  // read by all thread blocks before the first exchange, as the number of the exchange
     const int before = out.iterations;
@@ -247,6 +306,8 @@ extern "C" __global__ void __launch_bounds__(THREADS, PER_PROCESSOR) smoothed(co
     if (range.index > 0 || threadIdx.x > 0) return;
     out.seconds += 1e-9 * (nanoseconds() - begin);
     result = out;
-    s.slow[k] = slow_after(solver.way > SMOOTHED_FACTOR, out.iterations - before, memory.body.factor_step);
+    const bool useless = solver.way > SMOOTHED_FACTOR;
+    s.slow[k] = slow_after(memory.body, useless, out.iterations - before, solver.sweeps);
+    s.largest[k] = useless ? 0 : solver.largest;
     s.exchange_number[k] = solver.group.number;
 }

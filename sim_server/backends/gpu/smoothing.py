@@ -20,20 +20,22 @@ are so short that an empty launch counts."""
 class FactorSmoothing:
     """What solves leave to those that follow.
 
-    memory: on the device, by name: slow (bodies,) step of the factor with which a solve was slow last (`slow_after`),
-        unfinished (1,) step of the last solve that went on smoothed
+    memory: on the device, by name: slow (bodies,) with which factor a solve was slow last, and how slow (`slow_after`),
+        largest (bodies,) eigenvalue that a smoothing is made for, 0 until one was estimated, unfinished (1,) step of
+        the last solve that went on smoothed
     """
 
     def __init__(self, gpu: Gpu, bodies: int):
         new = partial(np.full, fill_value=-1, dtype=np.int64)
         self.memory: dict[str, DeviceArray] = {
             "slow": gpu.cp.asarray(new(bodies)),
+            "largest": gpu.cp.asarray(np.zeros(bodies)),
             "unfinished": gpu.cp.asarray(new(1)),
         }
 
     def state(self) -> list[StateArray]:
         """Returns what a run that goes on needs."""
-        found = device_arrays("engine.smoothing", self.memory, "slow")
+        found = device_arrays("engine.smoothing", self.memory, "slow", "largest")
         return [replace(array, added=True) for array in found]
 
     @classmethod

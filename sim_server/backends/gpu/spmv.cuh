@@ -19,7 +19,7 @@
 #endif
 #define SLAB (SLAB_ROWS * WARPS)     // rows that are copied to shared memory at a time if not all fit
 #define SLABS 2                      // buffers of a slab, used in turns
-#define SLAB_BLOCKS (17 * SLAB)      // most blocks of A in a slab; a slab with more is read from global memory
+#define SLAB_BLOCKS (17 * SLAB)      // most blocks of A in a slab, unless there is less room; a slab with more is read from global memory
 
 #ifdef ALONE
 // A is symmetric to the bit, so that the blocks on and above its diagonal are enough: they are kept in shared memory, all of them or
@@ -60,7 +60,14 @@ struct BlockRows {
     const real* blocks;
     int base;
     bool near;             // the rows of A are in shared memory
-    int slabs;             // offset of the buffers (SLABS, SLAB_BYTES) in shared memory, or -1
+    int slabs;             // offset of the SLABS buffers in shared memory, or -1
+#ifdef ALONE
+    static constexpr int slab_blocks = SLAB_BLOCKS;
+    static constexpr bool lent = false;
+#else
+    int slab_blocks;       // of A, for which each has room
+    bool lent;             // they are in memory of the inverse, which needs it between two products
+#endif
     int near_values, near_blocks, near_columns;  // offsets in shared memory, if they are there
 #ifdef ALONE
     int ring;              // blocks for which the window has room, 0: there is none
@@ -82,8 +89,9 @@ struct BlockRows {
 #endif
     }
 
-    // Allocates shared memory, for the most frequently used arrays first. inverted: there is an inverse.
-    __device__ __forceinline__ void set_up(const PcgArguments& s, const PcgBody& body, const RowRange& range, Arena& arena, bool inverted) {
+    // Allocates shared memory, for the most frequently used arrays first. inverted: there is an inverse, which lends the memory `spare` between
+    // its applications.
+    __device__ __forceinline__ void set_up(const PcgArguments& s, const PcgBody& body, const RowRange& range, Arena& arena, bool inverted, Arena spare) {
         begin = range.begin; own = range.own; halo = range.halo;
         nodes = s.halo + range.halo_first;
         values = arena.take<real>(3 * halo);
@@ -101,7 +109,7 @@ struct BlockRows {
 #ifdef ALONE
         if (!bring_upper(s, (int)row, range, arena, others))
 #endif
-            bring(s, (int)row, range, arena, others);
+            bring(s, (int)row, range, arena, spare, others);
         scale = inverted ? arena.take<Scale>(3 * own) : nullptr;
         r = taken(arena, s.own_vectors + 3 * row + all);
         q = taken(arena, s.own_vectors + 3 * row + 2 * all);
@@ -134,7 +142,8 @@ struct BlockRows {
     }
 
     // Copies the own rows of A into shared memory if they and `others` bytes fit, since loads after a barrier miss L1.
-    __device__ __forceinline__ void bring(const PcgArguments& s, int row, const RowRange& range, Arena& arena, int others) {
+    // Else they pass through it, if need be through memory that the inverse lends.
+    __device__ __forceinline__ void bring(const PcgArguments& s, int row, const RowRange& range, Arena& arena, Arena& spare, int others) {
         [[maybe_unused]] const int count = range.blocks;
         base = range.block_first;
         row_start = s.row_start + row;
@@ -146,6 +155,8 @@ struct BlockRows {
         near = false;
         int* start;
 #else
+        lent = false;
+        slab_blocks = SLAB_BLOCKS;
         real* v = arena.take<real>(9 * count);
         int *c = arena.take<int>(count), *start = arena.take<int>(own + 1);
         near = v && c && start && near_values >= 0 && arena.end - arena.next >= others;
@@ -155,7 +166,14 @@ struct BlockRows {
         if (!near) {
             arena = before;
             start = arena.take<int>(own + 1);
-            if (start && near_values >= 0) slabs = place_of(arena.take<char>(SLABS * SLAB_BYTES));
+            if (start && near_values >= 0) slabs = place_of(arena.take<char>(SLABS * slab_bytes()));
+#ifndef ALONE
+            lent = start && near_values >= 0 && slabs < 0;
+            if (lent) {
+                slab_blocks = min(SLAB_BLOCKS, (int)((spare.end - spare.next) / SLABS - slab_bytes(0)) / (9 * (int)sizeof(real) + 4) / 4 * 4);
+                slabs = slab_blocks > 0 ? place_of(spare.take<char>(SLABS * slab_bytes())) : -1;
+            }
+#endif
         }
         if (start)
             for (int k = threadIdx.x; k <= own; k += THREADS) copy_async(start + k, row_start + k, 4);
@@ -167,12 +185,14 @@ struct BlockRows {
         }
 #endif
         copies_begin();
-        if (slabs >= 0)
-            for (int k = 0; k < SLABS - 1; ++k) ask(k, row_start);
+        if (slabs >= 0 && !lent) ask_first(row_start);
         if (start) row_start = start;
     }
 
-    static constexpr int VALUE_BYTES = SLAB_BLOCKS * 9 * (int)sizeof(real) + 16, SLAB_BYTES = VALUE_BYTES + 4 * SLAB_BLOCKS + 16;
+    // Bytes of a buffer for so many blocks, a multiple of 4: values, then columns, each with what alignment skips.
+    static __device__ __forceinline__ int value_bytes(int count) { return count * 9 * (int)sizeof(real) + 16; }
+    static __device__ __forceinline__ int slab_bytes(int count) { return value_bytes(count) + 4 * count + 16; }
+    __device__ __forceinline__ int slab_bytes() const { return slab_bytes(slab_blocks); }
 
     struct Slab { int low, high, first, count; };  // rows, and their range in `blocks`
 
@@ -185,12 +205,15 @@ struct BlockRows {
     // Begins to copy a slab into its buffer, aligned to 16 bytes.
     __device__ __forceinline__ void ask(int k, const int* starts) const {
         const Slab s = slab(k, starts);
-        char* to = shared_memory + slabs + k % SLABS * SLAB_BYTES;
-        if (s.count <= SLAB_BLOCKS && s.count > 0) {
+        char* to = shared_memory + slabs + k % SLABS * slab_bytes();
+        if (s.count <= slab_blocks && s.count > 0) {
             all_of(to, blocks + 9ll * s.first, 9 * (int)sizeof(real) * s.count);
-            all_of(to + VALUE_BYTES, columns + s.first, 4 * s.count);
+            all_of(to + value_bytes(slab_blocks), columns + s.first, 4 * s.count);
         }
         copies_begin();
+    }
+    __device__ __forceinline__ void ask_first(const int* starts) const {
+        for (int k = 0; k < SLABS - 1; ++k) ask(k, starts);
     }
     static __device__ __forceinline__ void all_of(char* to, const void* from, int bytes) {
         const int skipped = (int)((unsigned long long)from & 15);
@@ -390,19 +413,20 @@ struct BlockRows {
     }
 
     // The rows pass through shared memory in slabs. The first slabs of the next product are copied after this one, beside other
-    // work; the number of slabs is a multiple of SLABS, so that each slab has its buffer.
+    // work, unless the memory is lent; the number of slabs is a multiple of SLABS, so that each slab has its buffer.
     template <class Done>
     __device__ __forceinline__ void through_slabs(Done done) const {
         const int count = (own + SLABS * SLAB - 1) / (SLABS * SLAB) * SLABS;
+        if (lent) ask_first(row_start);
         for (int k = 0; k < count; ++k) {
             copies_end<SLABS - 2>();
             __syncthreads();  // this slab is complete, and the one before is not read any more
-            const int next = k + SLABS - 1;
-            ask(next < count ? next : next - count, row_start);
+            if (k + SLABS - 1 < count) ask(k + SLABS - 1, row_start);
+            else copies_begin();
             const Slab s = slab(k, row_start);
             const int first = s.low + (int)threadIdx.x / 32;
             if (first >= s.high) continue;
-            if (s.count > SLAB_BLOCKS) {
+            if (s.count > slab_blocks) {
                 for (int row = first; row < s.high; row += TOGETHER * WARPS) {
                     real sum[TOGETHER];
                     of_far<TOGETHER>(row, s.high, sum);
@@ -410,13 +434,14 @@ struct BlockRows {
                 }
                 continue;
             }
-            const int here = slabs + k % SLABS * SLAB_BYTES;
+            const int here = slabs + k % SLABS * slab_bytes();
             const int a = here + (int)((unsigned long long)(blocks + 9ll * s.first) & 15);
-            const int c = here + VALUE_BYTES + (int)((unsigned long long)(columns + s.first) & 15);
+            const int c = here + value_bytes(slab_blocks) + (int)((unsigned long long)(columns + s.first) & 15);
             real sum[SLAB_ROWS];
             of_near<SLAB_ROWS>(first, s.high, base + s.first, a, c, sum);
             finish<SLAB_ROWS>(first, s.high, sum, done);
         }
+        if (!lent) ask_first(row_start);
     }
 
     // Passes the sums of rows first, first + WARPS, ... to `done`: lane 3 n + c has entry c of the n-th row.

@@ -138,9 +138,9 @@ class Async(UpdatePolicy):
         """Sends copies to idle workers in the order of the requests. With a prefetch depth others wait their turn."""
         driver = self.driver
         copied = driver.snapshots.completed()
-        if copied and (newest := copied[-1][0].job).request > self._newest_copy:
-            self._newest_copy = newest.request
-            self.prefetch.on_copy(time.monotonic() - newest.requested)
+        if new := [state.job for state, _ in copied if state.job.request > self._newest_copy]:
+            self._newest_copy = new[-1].request
+            self.prefetch.on_copy(time.monotonic() - sum(job.requested for job in new) / len(new))
         idle, now = driver.source.ready() if copied else 0, driver.engine.step
         made: list[tuple[BodyUpdateState, Job]] = []
         for state, step in copied:

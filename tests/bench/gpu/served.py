@@ -17,6 +17,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from protocol.process.memory import keep_long_lived
 from sim_server.service.service import ROUND_PERIOD
 from sim_server.service.supervisor import Supervisor
 from sim_server.simulation import Simulation
@@ -56,6 +57,7 @@ class Served:
         arguments = ("--device", "gpu") if self._worker == "gpu" else ()
         self._supervisor = Supervisor(1, "bench", [self._endpoint], arguments)
         self.driver = Driver(self.sim, self.link.dispatch)
+        keep_long_lived()  # as the server does
         self.engine.loop.stop = 0
         self._thread = threading.Thread(target=self._loop)
         self._thread.start()

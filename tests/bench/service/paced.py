@@ -19,8 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from protocol.factor import Factor
-from protocol.factors_together import FactorsTogether
 from sim_server.backends.cpu.structs import RECORD
+from sim_server.backends.factors_together import FactorsTogether
 from sim_server.backends.kinds import Kind
 from sim_server.service.service import ROUND_PERIOD
 from sim_server.simulation import Simulation

@@ -34,7 +34,7 @@ def library() -> c.CDLL:
     """Compiles and loads digits.cpp."""
     arguments = [*[c.c_int64] * 2, *[c.c_void_p] * 6, c.c_int32]
     signatures: dict[str, tuple[Any, list[Any]]] = {"largest_responses": (None, arguments)}
-    return native(TEXT, signatures)
+    return native(TEXT, signatures, stepping=False)  # Gpu.build names it
 
 
 def largest_responses(pattern: FactorPattern, values: Sequence[NDArray[np.floating]]) -> Float64:

@@ -19,6 +19,7 @@ from sim_server.arrays import Int64
 from sim_server.backends.compiler import native
 
 Count = TypeVar("Count", int, NDArray[Any])
+TEXT = "backends/gpu/inverse/tree_cuts.cpp"
 NODE = 3  # degrees of freedom of a node
 COLUMNS, ROWS = 32, 8  # of a chunk of the stored matrices
 
@@ -140,7 +141,7 @@ def library() -> c.CDLL:
         "tree_predict": (x, [*tree, n, n, n]), "tree_phase": (n, [n, n, p, p, p, n, n, p, p, p]),
         "balance_tiles": (n, [n, p, p, p, n, p]),
     }  # fmt: skip
-    return native("backends/gpu/inverse/tree_cuts.cpp", signatures)
+    return native(TEXT, signatures, stepping=False)  # Gpu.build names it
 
 
 def tree_arguments(tree: Tree, thresholds: tuple[int, ...]) -> tuple[Any, ...]:

@@ -122,6 +122,7 @@ struct PartitionedInverse {
     FlagWord<float> *residual, *product, *z, *formed, *solved, *contributed;
     SplitVector vector;
     float* tile_sums;        // (WARPS, 2, 16) of the tile that a warp ends, and of the one that it begins, where others have the rest
+    Arena lent;              // vector and sums: nobody needs them between two applications
     const int* lists;        // of the phases: first segment (phases + 1), first tile (phases + 1), first segment that is
                              // not formed here
     const WarpSegment* segments;
@@ -173,11 +174,13 @@ struct PartitionedInverse {
     __device__ __forceinline__ void reserve(const DevicePlan* shared_plan, int index, Arena& arena) {
         plan = shared_plan;
         size = plan->size; phases = plan->phases; groups = plan->groups;
+        lent = {arena.next, arena.next};
         vector.high = arena.take<unsigned short>(shared_plan->entries);
         vector.low = arena.take<unsigned short>(shared_plan->entries);
 #ifndef ALONE
         tile_sums = arena.take<float>(16 * 2 * WARPS);
 #endif
+        lent.end = arena.next;
         const BlockRanges part = plan->block_ranges[index];
         lists = brought(plan->lists + index * (3 * phases + 2), 3 * phases + 2, arena);
         tiles = brought(plan->tiles + part.tile, part.tiles, arena);
