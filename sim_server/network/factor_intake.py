@@ -85,8 +85,10 @@ class FactorIntake:
         self.begin_check: Callable[[Sequence[tuple[str, int]]], Check | None] = lambda jobs: None  # (FactorSource)
 
     def fetched_from(self, worker: str) -> int:
-        """Number of factors that are fetched from a worker part by part."""
-        return sum(self._decoding[number].job.worker == worker for number in self._fetches)
+        """Number of jobs that a worker has done, and whose factors are fetched from it part by part, or copied and
+        checked beside the caller: those of one message at most, as no more are to wait for that."""
+        beside = next((len(each.jobs) for each, _ in self._together if each.jobs and each.jobs[0].worker == worker), 0)
+        return beside + sum(self._decoding[number].job.worker == worker for number in self._fetches)
 
     def is_decoded(self, job: InFlightJob) -> bool:
         """True while the answer to a job is taken in beside the caller."""

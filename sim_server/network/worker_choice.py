@@ -17,7 +17,7 @@ class WorkerChoice:
     """Chooses among the workers that are available.
 
     shared: there is a pool of shared memory for arrays
-    fetched: returns the number of jobs that a worker has done, and whose factors are fetched from it part by part
+    fetched: returns the number of jobs that a worker has done, and whose factors are being taken in
     """
 
     def __init__(self, book: Bookkeeping, shared: bool, fetched: Callable[[str], int]):
@@ -56,8 +56,8 @@ class WorkerChoice:
         return {name: room for name, room in free.items() if may_get_job(name, available, now)}
 
     def _waiting(self, worker: str) -> int:
-        """Number of jobs that a worker has not done yet; those whose parts are fetched are done."""
-        return self._book.leases.count(worker) - self._fetched(worker)
+        """Number of jobs that a worker has not done yet; those whose factors are being taken in are done."""
+        return max(0, self._book.leases.count(worker) - self._fetched(worker))
 
     def candidates(self, idle: list[str], object: str) -> list[str]:
         """Idle workers that are not suspended for the object; all idle ones if all available workers are."""

@@ -4,7 +4,7 @@
 import gc
 import weakref
 
-from protocol.process.memory import keep_long_lived
+from protocol.process.memory import YOUNG, keep_long_lived
 
 
 class Node:
@@ -12,9 +12,10 @@ class Node:
 
 
 def test_collections_go_through_what_was_made_since_alone():
-    before = len(gc.get_objects())
+    before, threshold = len(gc.get_objects()), gc.get_threshold()
     try:
         keep_long_lived()
+        assert gc.get_threshold() == (max(YOUNG, threshold[0]), *threshold[1:])
         assert gc.get_freeze_count() > before / 2 and len(gc.get_objects()) < before / 10
         node = Node()
         node.itself, seen = node, weakref.ref(node)
@@ -23,3 +24,4 @@ def test_collections_go_through_what_was_made_since_alone():
         assert seen() is None
     finally:
         gc.unfreeze()
+        gc.set_threshold(*threshold)

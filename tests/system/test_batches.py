@@ -387,7 +387,10 @@ def test_large_batches_are_checked_where_they_are_decoded(
 def test_large_batches_are_decoded_beside_the_caller(stage: Hand, monkeypatch: pytest.MonkeyPatch) -> None:
     """All count as large here. Meanwhile nothing is taken and second answers are refused; then each counts alone."""
     monkeypatch.setattr(factor_intake, "LARGE_MESSAGE", 0)
+    dispatch = stage.driver.link.dispatch
+    free = dispatch.ready()
     batch, go = stage.batch(), threading.Event()
+    assert dispatch.ready() == free - len(NAMES)
     decode, before = stage.driver.link.dispatch.decoder.decode_several, stage.driver.link.counters.refusals["duplicate"]
 
     def slow(*arguments: Any) -> Any:
@@ -401,6 +404,7 @@ def test_large_batches_are_decoded_beside_the_caller(stage: Hand, monkeypatch: p
     stage.send(stage.answer(batch, [0]))
     stage.driver.until(lambda: stage.driver.link.counters.refusals["duplicate"] == before + 2, "the second answers")
     assert not stage.driver.factors and stage.driver.link.slots_lent == 2
+    assert dispatch.ready() == free, "its worker has done them"
     go.set()
     stage.driver.until(lambda: all_are_back(stage), "the factors")
     stage.check_factors()

@@ -111,7 +111,7 @@ static bool close_batch(GpuLoop& l) {
 
 // The ring has room for the records of three batches, those under way and one that is read meanwhile: one that finds no room is slow.
 static int64_t batch_size(GpuLoop& l, int64_t left) {
-    int64_t size = l.rings.realtime || l.step_seconds == 0 ? 1 : (int64_t)std::min(l.batch_seconds / l.step_seconds, (double)l.batch);
+    int64_t size = l.rings.realtime || l.step_seconds == 0 ? 1 : (int64_t)(l.batch_seconds / l.step_seconds) + 1;
     const int64_t room = l.rings.record_capacity / (3 * l.bodies);
     return std::max<int64_t>(1, std::min({size, left, room, l.batch - l.launched % l.batch}));  // so none goes over the end of the device's rings
 }

@@ -118,7 +118,7 @@ struct GpuLoop {
     Address poses, pose_staging;           // of obstacles, likewise; nothing without contact
     int64_t pose_bytes;                    // of all obstacles; 0 without contact
     double* clock;                         // (1,) time of the simulation [s], for readers on the host
-    double batch_seconds;                  // most that a batch of several steps lasts [s]
+    double batch_seconds;                  // largest aim for the duration of a batch [s]
     double poll;                           // [s] between queries of an event that is nearly due
     double step_seconds;                   // of the last batch, 0: not known
     double idle_since;                     // time at which the device ran dry, or the end of the last batch was seen

@@ -25,7 +25,7 @@ BATCH = 16  # most steps whose results are read together
 GRAPH_STEPS = (1, 2, 8)  # of which there are graphs
 CAPACITY = 64  # steps whose results are kept; more than can be under way
 FRAMES = 8  # in the ring
-BATCH_SECONDS = 2e-3  # duration of a batch of more than one step, at most [s]; requests wait for two batches at most
+BATCH_SECONDS = 2e-3  # aim for the duration of a batch [s]; requests wait for two batches at most
 DOUBLED = 512 << 20  # bytes of the matrices of all bodies, up to which each has two places for copies
 POLL = 1e-5  # interval between queries of an event [s]
 
