@@ -208,6 +208,7 @@ class Solver:
     ):  # fmt: skip
         monkeypatch.setattr(solver_layout, "alone", lambda *a: alone)
         monkeypatch.setattr(solver_layout, "threads_and_blocks", lambda *a: (THREADS, 1))
+        monkeypatch.setattr(solver_layout, "threads_alone", lambda *a: THREADS)
         monkeypatch.setattr(gpu_solver, "compiled", lambda name, module, kernel: SimpleNamespace())
         assigned = lambda nodes, processors, most: (assign_blocks(nodes, blocks), blocks)  # noqa: E731
         monkeypatch.setattr(solver_layout, "best_assignment", assigned)

@@ -4,15 +4,18 @@
 import numpy as np
 import pytest
 
+from sim_server.backends.gpu import row_partition
 from sim_server.backends.gpu.row_partition import ROW_RANGE
 from tests.backends.pcg_on_threads import SOLVE, Solver, compiled, steps
 from tests.backends.test_gpu_correction import grabbed, hold
 from tests.scenes import bar, simulation
 
 
-@pytest.fixture(scope="module")
-def library(tmp_path_factory):
-    return compiled(tmp_path_factory.mktemp("alone"), SOLVE, "ALONE")
+@pytest.fixture(scope="module", params=[8, 4])  # rows of a slab for each warp: of up to eight warps, and of more
+def library(request, tmp_path_factory):
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(row_partition, "warp_rows", lambda warps: request.param)
+        yield compiled(tmp_path_factory.mktemp("alone"), SOLVE, "ALONE", f"WARP_ROWS={request.param}")
 
 
 def solved(library, monkeypatch, shared: int | None = None, window: int | None = None):

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sim_server.arrays import Int32
-from sim_server.backends.gpu.row_partition import AHEAD, COLUMN_BITS, WARP_ROWS, halo, mirrored
+from sim_server.backends.gpu.row_partition import AHEAD, COLUMN_BITS, halo, mirrored, warp_rows
 
 SEEDS = st.integers(0, 2**32 - 1)
 
@@ -25,7 +25,7 @@ def pattern(rng: np.random.Generator, nodes: list[int], reach: int) -> tuple[np.
 
 
 @settings(max_examples=20, deadline=None)
-@given(seed=SEEDS, reach=st.sampled_from([2, 9, 200]), warps=st.sampled_from([1, 4]))
+@given(seed=SEEDS, reach=st.sampled_from([2, 9, 200]), warps=st.sampled_from([1, 4, 16]))
 def test_each_block_is_found_in_the_window(seed, reach, warps):
     """A window is filled as the kernel fills it; each word of a slab must find its block there."""
     rng = np.random.default_rng(seed)
@@ -34,7 +34,7 @@ def test_each_block_is_found_in_the_window(seed, reach, warps):
     partition = halo(ranges, np.ones(3, np.int64), row_start, columns)
     lists = mirrored(partition, row_start, columns, warps)
     words = lists["local_column"].view(np.uint32)
-    slab = WARP_ROWS * warps
+    slab = warp_rows(warps) * warps
     for body, (first, last) in enumerate(ranges.tolist()):
         own, size = last - first, int(partition.ranges["window"][body])
         upper = lists["upper_start"][first + body : last + body + 1]

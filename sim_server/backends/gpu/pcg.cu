@@ -36,10 +36,16 @@
 #include "smoothing_state.cuh"
 #endif
 
-#ifdef ALONE
+#ifdef ALONE  // d r is written once, after the update, and a barrier stands before it is read; of A p nothing is exchanged
 #define HELD &
 #else
 #define HELD
+#endif
+#define AT_A_TIME (WARPS > 8 ? 5 : 3)  // entries of a vector
+#if defined(ALONE) && WARPS > 8  // 128 registers a thread, and fewer for the chunks under way
+#define INVERSE_HELD &
+#else
+#define INVERSE_HELD
 #endif
 
 struct BlockMemory {  // static shared memory of a thread block: data that is the same in all threads needs no registers
@@ -48,7 +54,7 @@ struct BlockMemory {  // static shared memory of a thread block: data that is th
     DevicePlan plan;
     BlockRows rows;
     PartitionedInverse inverse;
-    real* d;                       // (own, 3) scale of the own degrees of freedom, or null
+    Scale* d;                      // (own, 3) scale of the own degrees of freedom, or null
     real* diagonal;                // (own, 9) inverses of the diagonal blocks
     double peak;                   // largest scale
     int next, bad, rests;
@@ -211,8 +217,12 @@ struct PcgSolver {
         return z;
     }
 
-    static __device__ __forceinline__ FlagWord<float>* residuals(int half) {
+    static __device__ __forceinline__ FlagWord<float>* residuals([[maybe_unused]] int half) {
+#ifdef ALONE
+        return memory.inverse.residual;
+#else
         return memory.inverse.residual + (long long)half * (memory.inverse.size + 32);
+#endif
     }
 
     // 1. r = b - A x for the x of the scene, as a pending update by alpha = 1: x = 0 + 1 x, r = b - 1 (A x). With alpha = 0 the
@@ -254,9 +264,11 @@ struct PcgSolver {
             pass.last[begin + k] = given ? (real)rk : -qk;
             if (given && first_of_solve) pass.first[begin + k] = (real)rk;
 #endif
+#ifndef ALONE
             if (!packed) return;
             publish(turn, k, bk);
             publish(1 - turn, k, (real)rk);  // not b - A x from float words, which near the solution would be rounding errors
+#endif
         });
         r_number = group.number;
         into_three<2>(mine);
@@ -420,7 +432,9 @@ struct PcgSolver {
         rows.multiply([&](int node, int c, real q) {
             const int k = 3 * node + c;
             rows.keep_product(k, q, mine);
+#ifndef ALONE
             if (packed) publish_product(k, q);
+#endif
         });
         q_number = group.number;
         into_three<4>(mine);
@@ -432,9 +446,46 @@ struct PcgSolver {
 #endif
     }
 
+#ifdef ALONE
+    // x += alpha p, r -= alpha q, and d r for the inverse. Loads of x travel together, as it may be in memory.
+    __device__ __forceinline__ void update(real alpha) const {
+        const BlockRows HELD rows = memory.rows;
+        const int count = 3 * rows.own;
+        for (int first = threadIdx.x; first < count; first += AT_A_TIME * THREADS) {
+            real x[AT_A_TIME];
+            if (alpha != 0)
+#pragma unroll
+                for (int n = 0; n < AT_A_TIME; ++n) x[n] = rows.x[min(first + n * THREADS, count - 1)];
+#pragma unroll
+            for (int n = 0; n < AT_A_TIME; ++n) {
+                const int k = first + n * THREADS;
+                if (k >= count) break;
+                real r = rows.r[k];
+                if (alpha != 0) {
+                    r -= alpha * rows.q[k];
+                    rows.r[k] = r;
+                    rows.x[k] = x[n] + alpha * rows.values[k];
+                }
+                if (packed) publish(0, k, r);
+            }
+        }
+    }
+#endif
+
     // 3. 4. 5. 6. x += alpha p, r -= alpha q, z = P^-1 r; returns z . r. r2: |r|^2 after the update.
     __device__ __forceinline__ double precondition(int kind, real alpha, double r2) {
-        const BlockRows HELD rows = memory.rows;
+        [[maybe_unused]] const BlockRows HELD rows = memory.rows;
+#ifdef ALONE
+#ifdef CORRECTED
+        if (column >= 0) {
+            for (int k = threadIdx.x; k < 3 * rows.own; k += THREADS) {
+                const CorrectionMemory& m = memory.correction;
+                publish(0, k, 3 * (m.node[column / 3] - rows.begin) + column % 3 == k);
+            }
+        } else
+#endif
+            update(alpha);
+#else
         for (int k = threadIdx.x; k < 3 * rows.own; k += THREADS) {
 #ifdef CORRECTED
             if (column >= 0) {
@@ -452,6 +503,7 @@ struct PcgSolver {
             }
             if (packed) publish(1 - turn, k, r);
         }
+#endif
 #ifdef BUDGETS
         double mine[2], zr[2];
 #else
@@ -503,8 +555,9 @@ struct PcgSolver {
         return mine;
     }
 
+
     __device__ __forceinline__ double by_inverse(real alpha, double r2) {
-        const PartitionedInverse inverse = memory.inverse;
+        const PartitionedInverse INVERSE_HELD inverse = memory.inverse;
         // a power of two that scales d r below 1, for the small range of float16
         const float unit = unit_for(r2 * memory.peak * memory.peak);
         ResidualSource from = {residuals(turn), r_number, q_number, fresh ? 0 : (float)alpha};  // the update is being applied
@@ -515,8 +568,9 @@ struct PcgSolver {
 #else
         fresh = false;
 #endif
-#if defined(ALONE) && defined(CORRECTED)
-        __syncthreads();  // a column is published just before
+#ifdef ALONE
+        from = {residuals(0), group.number, 0, 0};
+        __syncthreads();  // it is published just before
 #endif
         if (!fetched) fetch();
         if (!arrived) copies_end<0>();
@@ -721,8 +775,12 @@ struct PcgSolver {
     __device__ __forceinline__ void leave(bool from_start, double r2) {
         const BlockRows& rows = memory.rows;
         real* r = s.own_vectors + 3ll * (memory.body.first + rows.begin) + 3ll * s.nodes;
-        for (int k = threadIdx.x; k < 3 * rows.own; k += THREADS) r[k] = rows.r[k] - (from_start ? rows.q[k] : 0);
-        if (!from_start) give(0, 0);
+        real* x = s.y + 3ll * (memory.body.first + rows.begin);
+#pragma unroll 1
+        for (int k = threadIdx.x; k < 3 * rows.own; k += THREADS) {
+            r[k] = rows.r[k] - (from_start ? rows.q[k] : 0);
+            if (!from_start) x[k] = 0;
+        }
         memory.out.status = SLOW;
         memory.out.residual = sqrt(r2 / memory.b2);
     }

@@ -147,8 +147,12 @@ def lists_of(partition: Halo) -> dict[str, NDArray[np.int32]]:
 
 
 AHEAD, COLUMN_BITS = 1, 15  # of spmv.cuh
-WARP_ROWS = 8  # rows of a slab for each warp
 ROW_BLOCKS = 17  # most blocks of A in a slab for each of its rows
+
+
+def warp_rows(warps: int) -> int:
+    """Returns the rows of a slab for each of the warps of a thread block."""
+    return 4 if warps > 8 else 8
 
 
 def mirrored(partition: Halo, row_start: Int32, columns: Int32, warps: int) -> dict[str, NDArray[np.int32]]:
@@ -168,7 +172,7 @@ def mirrored(partition: Halo, row_start: Int32, columns: Int32, warps: int) -> d
     body = np.repeat(np.arange(len(ranges)), ranges["blocks"])
     rank = rank[other] - rank[first][body]
     word = (rank << COLUMN_BITS + 1) | (np.where(above, 0, 1) << COLUMN_BITS) | partition.local
-    lowest, uppers, slab = np.empty(total, np.int64), [], WARP_ROWS * warps
+    lowest, uppers, slab = np.empty(total, np.int64), [], warp_rows(warps) * warps
     for k, (own, at) in enumerate(zip(ranges["own"].tolist(), first.tolist(), strict=True)):
         low = int(rows[at])
         upper = of_row[low : low + own + 1] - of_row[low]

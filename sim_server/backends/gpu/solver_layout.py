@@ -28,6 +28,7 @@ from sim_server.backends.gpu.solver_features import SolverFeatures
 BLOCK_BYTES, NODE_BYTES, OTHER_BYTES = 76, 216, 5120
 FILLING = 100  # nodes of a body that keep a multiprocessor busy
 DECLARED, DECLARED_CORRECTED = 2048, 5120  # bytes of shared memory that pcg.cu declares
+DECLARED_WARPS = 1024  # and what more than eight warps add to that
 DRIVER = 1024  # bytes of it that the driver takes for each thread block
 
 
@@ -51,6 +52,18 @@ def threads_and_blocks(
         return 128, 2
     needed = np.median(BLOCK_BYTES * blocks + NODE_BYTES * nodes) + OTHER_BYTES
     return (128, 2) if shared / 4 < needed <= shared / 2 else (64, 4)
+
+
+def threads_alone(nodes: Int64, blocks: Int64, shared: int) -> int:
+    """Returns threads of a thread block that has a multiprocessor and its body for itself.
+
+    Where shared memory does not hold the half of A that is kept, that half and most of the factor are fetched in every
+    iteration. Twice the warps, with half the registers each, then have more of it under way.
+
+    nodes, blocks (bodies,): of each body and of its rows of A. shared: bytes of a multiprocessor
+    """
+    needed = np.median(BLOCK_BYTES / 2 * blocks + NODE_BYTES * nodes) + OTHER_BYTES
+    return 256 if needed <= shared else 512
 
 
 def alone(nodes: Int64, blocks: Int64, count: Int64) -> bool:
@@ -100,12 +113,15 @@ class SolverLayout:
         threads, per_processor = threads_and_blocks(nodes, rows, processors, memory, features.exchanges)
         assigned, most = best_assignment(nodes, processors, per_processor)
         grid = most if assigned.pooled else int(assigned.blocks.sum())
-        declared = DECLARED_CORRECTED if features.correction else DECLARED
+        separate = not features.exchanges and alone(nodes, rows, assigned.blocks)
+        if separate and per_processor == 1:
+            threads = threads_alone(nodes, rows, memory)
+        declared = (DECLARED_CORRECTED if features.correction else DECLARED) + (DECLARED_WARPS if threads > 256 else 0)
         partition = halo(spans, assigned.blocks, pattern[0], pattern[1][: pattern[0][-1]])
         made = cls(
             spans, threads, per_processor, grid, spared=processors - -(-grid // per_processor),
             shared=(memory // per_processor - declared - DRIVER) // 16 * 16, assigned=assigned,
-            alone=not features.exchanges and alone(nodes, rows, assigned.blocks), partition=partition,
+            alone=separate, partition=partition,
             lists=lists_of(partition), halo=len(partition.nodes),
         )  # fmt: skip
         if features.most_blocks:

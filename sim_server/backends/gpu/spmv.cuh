@@ -25,14 +25,24 @@
 // A is symmetric to the bit, so that the blocks on and above its diagonal are enough: they are kept in shared memory, all of them or
 // those of a window of rows that moves down. Each block of A has a word: 65536 times the rank of the block that is kept, among
 // those of the body; whether it is transposed; its column.
-#define WARP_ROWS 8                  // rows that a warp multiplies at a time, each by four lanes
+#ifndef WARP_ROWS
+#define WARP_ROWS (WARPS > 8 ? 4 : 8)    // rows that a warp multiplies at a time
+#endif
+#define ROW_LANES (32 / WARP_ROWS)       // lanes that share a row: 4 or 8
 #define WINDOW_ROWS (WARP_ROWS * WARPS)  // of a slab of the window
 #define WINDOW_BLOCKS (17 * WINDOW_ROWS) // most blocks of A in it
 #define AHEAD 1                      // slabs on their way while one is multiplied
+static_assert(AHEAD == 1, "through_window");
 #define COLUMN 0x7fff
 #define TRANSPOSED 0x8000
 #else
 #define COLUMN -1
+#endif
+
+#ifdef ALONE
+using Scale = float;
+#else
+using Scale = real;
 #endif
 
 struct BlockRows {
@@ -44,7 +54,7 @@ struct BlockRows {
 #ifdef ERRORS
     real* before;          // (own, 3) x at the last look (iterate_error.cuh)
 #endif
-    real* scale;           // (own, 3) of the inverse, or null
+    Scale* scale;          // (own, 3) of the inverse, or null
     const int* row_start;  // (own + 1,), less `base`
     const int* columns;    // indices into the halo
     const real* blocks;
@@ -100,7 +110,7 @@ struct BlockRows {
         if (!bring_upper(s, (int)row, range, arena, others))
 #endif
             bring(s, (int)row, range, arena, spare, others);
-        scale = inverted ? arena.take<real>(3 * own) : nullptr;
+        scale = inverted ? arena.take<Scale>(3 * own) : nullptr;
         r = taken(arena, s.own_vectors + 3 * row + all);
         q = taken(arena, s.own_vectors + 3 * row + 2 * all);
 #ifdef ALONE  // of all vectors it is used least
@@ -175,7 +185,8 @@ struct BlockRows {
         }
 #endif
         copies_begin();
-        if (slabs >= 0 && !lent) ask_first(row_start);
+        if (slabs >= 0 && !lent)
+            for (int k = 0; k < SLABS - 1; ++k) ask(k, row_start);
         if (start) row_start = start;
     }
 
@@ -201,9 +212,6 @@ struct BlockRows {
             all_of(to + value_bytes(slab_blocks), columns + s.first, 4 * s.count);
         }
         copies_begin();
-    }
-    __device__ __forceinline__ void ask_first(const int* starts) const {
-        for (int k = 0; k < SLABS - 1; ++k) ask(k, starts);
     }
     static __device__ __forceinline__ void all_of(char* to, const void* from, int bytes) {
         const int skipped = (int)((unsigned long long)from & 15);
@@ -257,7 +265,7 @@ struct BlockRows {
             ask_rows(0, own, 0, 0);
             copies_begin();
         } else {
-            for (int k = 0; k < AHEAD; ++k) ask_upper(k, 0, 0);
+            ask_upper(0, slab<WINDOW_ROWS>(0, row_start), 0, 0);
         }
         return true;
     }
@@ -268,20 +276,31 @@ struct BlockRows {
         return place < ring ? place : place - ring;
     }
 
-    // Begins to copy the blocks of rows from the diagonal on, a row by each warp.
+    // Begins to copy the blocks of rows from the diagonal on, half a warp two of them, whose sizes are loaded together.
     __device__ __forceinline__ void ask_rows(int low, int high, int first, int at) const {
-        const int lane = threadIdx.x % 32;
+        constexpr int STEP = THREADS / 16;
+        const int lane = threadIdx.x % 16;
         real* window = (real*)(shared_memory + near_blocks);
-        for (int row = low + (int)threadIdx.x / 32; row < high; row += WARPS) {
-            const int rank = upper[row], count = 9 * (upper[row + 1] - rank), place = placed(rank, first, at), room = 9 * (ring - place);
-            const real* from = blocks + 9ll * (row_start[row + 1] - base) - count;
-            for (int k = lane; k < count; k += 32) copy_async(window + 9 * place + (k < room ? k : k - 9 * ring), from + k, sizeof(real));
+        for (int begin = low + (int)threadIdx.x / 16; begin < high; begin += 2 * STEP) {
+            int place[2], count[2];
+            const real* from[2];
+#pragma unroll
+            for (int n = 0; n < 2; ++n) {
+                const int row = min(begin + n * STEP, high - 1), rank = upper[row];
+                count[n] = begin + n * STEP < high ? 9 * (upper[row + 1] - rank) : 0;
+                place[n] = placed(rank, first, at);
+                from[n] = blocks + 9ll * (row_start[row + 1] - base) - count[n];
+            }
+#pragma unroll
+            for (int n = 0; n < 2; ++n) {
+                const int room = 9 * (ring - place[n]);
+                for (int k = lane; k < count[n]; k += 16) copy_async(window + 9 * place[n] + (k < room ? k : k - 9 * ring), from[n] + k, sizeof(real));
+            }
         }
     }
 
-    // Begins to copy a slab into the window, and its words.
-    __device__ __forceinline__ void ask_upper(int k, int first, int at) const {
-        const Slab s = slab<WINDOW_ROWS>(k, row_start);
+    // Begins to copy the k-th slab into the window, and its words.
+    __device__ __forceinline__ void ask_upper(int k, const Slab& s, int first, int at) const {
         if (s.low < s.high) {
             ask_rows(s.low, s.high, first, at);
             all_of(shared_memory + near_columns + k % (AHEAD + 1) * WORD_BYTES, columns + s.first, 4 * s.count);
@@ -289,36 +308,44 @@ struct BlockRows {
         copies_begin();
     }
 
-    // The window moves down A. Its first slabs for the next product are copied after this one, beside other work.
+    // The window moves down A. Its first slab for the next product is copied after this one, beside other work. Where the next slabs are is
+    // looked up before the barrier.
     template <class Done>
     __device__ __forceinline__ void through_window(Done done) const {
         const int count = (own + WINDOW_ROWS - 1) / WINDOW_ROWS;
+        Slab s = slab<WINDOW_ROWS>(0, row_start), next = slab<WINDOW_ROWS>(1, row_start);
+        int first = 0, at = 0;
         for (int k = 0; k < count; ++k) {
-            const Slab s = slab<WINDOW_ROWS>(k, row_start);
-            int origin = base, first = 0, at = 0, c = near_columns;
+            int origin = base, c = near_columns;
             if (!whole) {
                 copies_end<AHEAD - 1>();
                 __syncthreads();  // this slab is complete, and the one before is not read any more
-                first = lowest[k];
-                at = first % ring;
-                ask_upper(k + AHEAD, first, at);
+                ask_upper(k + AHEAD, next, first, at);
                 origin += s.first;
                 c += k % (AHEAD + 1) * WORD_BYTES + (int)((unsigned long long)(columns + s.first) & 15);
             }
             of_window(s.low + WARP_ROWS * (int)(threadIdx.x / 32), s.high, origin, c, first, at, done);
+            s = next;
+            next = slab<WINDOW_ROWS>(k + 1 + AHEAD, row_start);
+            if (!whole && k + 1 < count) {
+                const int then = first;
+                first = lowest[k + 1];
+                at += first - then;
+                at -= at < ring ? 0 : ring;
+            }
         }
         if (whole) return;
         __syncthreads();
-        for (int k = 0; k < AHEAD; ++k) ask_upper(k, 0, 0);
+        ask_upper(0, slab<WINDOW_ROWS>(0, row_start), 0, 0);
     }
 
-    // Rows low, low + 1, ... of a warp: lane 4 n + h adds every fourth block of the n-th, from the h-th on. c_at: offset of the words from
-    // the block on that is `origin`-th. first, at: of the window (placed).
+    // Rows low, low + 1, ... of a warp: lane ROW_LANES n + h adds blocks h, h + ROW_LANES, ... of the n-th. c_at: offset of the words
+    // from the block on that is `origin`-th. first, at: of the window (placed).
     template <class Done>
     __device__ __forceinline__ void of_window(int low, int end, int origin, int c_at, int first, int at, Done done) const {
         const real *a_of = shared_at<real>(near_blocks), *v_of = shared_at<real>(near_values);
         const int* c_of = shared_at<int>(c_at);
-        const int lane = threadIdx.x % 32, h = lane % 4, node = low + lane / 4, size = ring;
+        const int lane = threadIdx.x % 32, h = lane % ROW_LANES, node = low + lane / ROW_LANES, size = ring;
         int k = 0, last = 0;
         if (node < end) {
             k = row_start[node] - origin + h;
@@ -326,7 +353,7 @@ struct BlockRows {
         }
         real sum[3] = {0, 0, 0};
 #pragma unroll 2
-        for (; k < last; k += 4) {
+        for (; k < last; k += ROW_LANES) {
             const unsigned word = c_of[k];
             const bool transposed = word & TRANSPOSED;
             int place = (int)(word >> 16) - first + at;
@@ -337,12 +364,14 @@ struct BlockRows {
             sum[1] += a[row] * v0 + a[4] * v1 + a[row + 2 * column] * v2;
             sum[2] += a[2 * row] * v0 + a[2 * row + column] * v1 + a[8] * v2;
         }
+        // Of the lanes of a row the half with the larger h adds up entry 2, and of the others half each entries 0 and 1.
+        const bool third = h & ROW_LANES / 2, second = h & ROW_LANES / 4;
+        const real given = __shfl_xor_sync(ALL, third ? sum[0] : sum[2], ROW_LANES / 2), middle = __shfl_xor_sync(ALL, sum[1], ROW_LANES / 2);
+        const real one = (third ? sum[2] : sum[0]) + given, two = third ? one : sum[1] + middle;
+        real mine = (second ? two : one) + __shfl_xor_sync(ALL, second ? one : two, ROW_LANES / 4);
 #pragma unroll
-        for (int r = 0; r < 3; ++r) {
-            sum[r] += __shfl_xor_sync(ALL, sum[r], 1);
-            sum[r] += __shfl_xor_sync(ALL, sum[r], 2);
-        }
-        if (node < end && h < 3) done(node, h, h == 0 ? sum[0] : h == 1 ? sum[1] : sum[2]);
+        for (int by = ROW_LANES / 8; by > 0; by /= 2) mine += __shfl_xor_sync(ALL, mine, by);
+        if (node < end && h % (ROW_LANES / 4) == 0 && h < 3 * ROW_LANES / 4) done(node, h / (ROW_LANES / 4), mine);
     }
 #endif
 
@@ -386,12 +415,14 @@ struct BlockRows {
     template <class Done>
     __device__ __forceinline__ void through_slabs(Done done) const {
         const int count = (own + SLABS * SLAB - 1) / (SLABS * SLAB) * SLABS;
-        if (lent) ask_first(row_start);
-        for (int k = 0; k < count; ++k) {
-            copies_end<SLABS - 2>();
-            __syncthreads();  // this slab is complete, and the one before is not read any more
-            if (k + SLABS - 1 < count) ask(k + SLABS - 1, row_start);
-            else copies_begin();
+        for (int k = lent ? 1 - SLABS : 0; k < count; ++k) {  // one place that asks: its code is long
+            if (k >= 0) {
+                copies_end<SLABS - 2>();
+                __syncthreads();  // this slab is complete, and the one before is not read any more
+            }
+            const int next = k + SLABS - 1;
+            if (next < count || !lent) ask(next < count ? next : next - count, row_start);
+            if (k < 0) continue;
             const Slab s = slab(k, row_start);
             const int first = s.low + (int)threadIdx.x / 32;
             if (first >= s.high) continue;
@@ -410,7 +441,6 @@ struct BlockRows {
             of_near<SLAB_ROWS>(first, s.high, base + s.first, a, c, sum);
             finish<SLAB_ROWS>(first, s.high, sum, done);
         }
-        if (!lent) ask_first(row_start);
     }
 
     // Passes the sums of rows first, first + WARPS, ... to `done`: lane 3 n + c has entry c of the n-th row.

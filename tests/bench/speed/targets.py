@@ -9,7 +9,8 @@ PHASES = "latency: the phases of the partitioned inverse, each one or two trips 
 BYTES = "bytes of the partitioned inverse at the bandwidth of the memory, a fifth more between phases"
 LINKS = "half of these bytes on each, and the levels at the top of the tree, whose vectors cross between them"
 AGE = "iterations while the factor is too old for what happened"
-WAVES = "instructions of the eight warps that a body has for itself, which wait for one another; and the assembly"
+MANY = "memory while all apply their inverses, latency in the rest of an iteration; and the assembly"
+SMALL = "latency: each part of a solve is short, and one body at a time has a multiprocessor; and the assembly"
 STAGES = "factorization and inverse, then the way between two processes"
 RECORDS = "records of each body, which the loop's thread completes one after the other"
 THREAD = "the thread that serves the loop: copies out, factors in, in Python"
@@ -106,8 +107,8 @@ TARGETS = (
     _many("the same, 1,024 bodies", "swinging", 1024, "factors/s", 150, 5000, "1/s"),
     _many("the same: age of factors, mean", "swinging", 1024, "factor age", 958, 50, "steps"),
     _steps("host time of a step, 1,024 bodies of 540", 540, 360, 40, RECORDS, "host us", "us", beams=1024),
-    _steps("GPU, 256 bodies of 3,000", 3000, 2.24, 1.6, WAVES, beams=256),
-    _steps("GPU, 512 bodies of 540", 540, 0.81, 0.6, WAVES, beams=512),
+    _steps("GPU, 256 bodies of 3,000", 3000, 2.24, 1.6, MANY, beams=256),
+    _steps("GPU, 512 bodies of 540", 540, 0.81, 0.6, SMALL, beams=512),
     _steps("GPU, 24,000 tetrahedra", 24_000, None, 0.16, PHASES),
     _steps("GPU, 24,000, heterogeneous: p99", 24_000, 2.6, 1.2, AGE, "p99", material="heterogeneous"),
     _steps("GPU, 98,304 tetrahedra", 98_304, None, 0.55, BYTES),

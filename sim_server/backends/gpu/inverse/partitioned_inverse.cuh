@@ -5,10 +5,10 @@
 // factor of one as they are: their columns 0, 1 and 4, 5 its row, columns 2, 3 and 6, 7 its row eight further down. So of the right
 // factor, which is the vector, four columns are used: its halves for the former and for the latter, as two numbers of float16
 // (value = high + low / 2048), which keep 22 bits of it, nearly those of float32. A warp needs five instructions for 1024 bytes of
-// matrix, so memory is the limit. The warps of a thread block have equal shares of the chunks of a phase, wherever in a tile they begin
-// and end.
+// matrix, so memory is the limit.
 //
-// With -DALONE, where little is left between phases, warps have whole tiles, and products are of 16 rows: two columns are used.
+// The warps of a thread block have equal shares of the chunks of a phase, wherever in a tile they begin and end; with -DALONE whole tiles,
+// since phases are short and of many tiles.
 #pragma once
 #include "block_group.cuh"
 #ifdef HELPED
@@ -19,7 +19,8 @@
 constexpr int PADDING = 32;  // entries behind vectors, to which padding refers
 #define LISTS 32768   // most bytes of a list that is copied to shared memory
 #ifdef ALONE          // words are at hand: few registers matter more
-#define CHUNKS_AT_ONCE 4
+#define CHUNKS_AT_ONCE (WARPS > 8 ? 2 : 4)
+#define UNDER_WAY (WARPS > 8 ? 2 : 3)  // groups of so many chunks, for each warp
 #define FEW 2         // segments that a warp loads at a time, for short lists
 #define MANY 4
 #else
@@ -66,11 +67,7 @@ __device__ __forceinline__ void put_halves(const SplitVector& to, int i, float v
 
 // Place of entry `lane` of a segment in the vector.
 __device__ __forceinline__ int entry_place(int lane) {
-#ifdef ALONE
-    return lane;
-#else
     return (lane & ~6) | (lane & 2) << 1 | (lane & 4) >> 1;  // of each eight: 0, 1, 4, 5, 2, 3, 6, 7
-#endif
 }
 
 __device__ __forceinline__ unsigned shared_address(const void* p) { return (unsigned)__cvta_generic_to_shared(p); }
@@ -78,6 +75,15 @@ __device__ __forceinline__ unsigned shared_address(const void* p) { return (unsi
 __device__ __forceinline__ uint4 shared_vector_load(unsigned from) {
     uint4 v;
     asm volatile("ld.shared.v4.u32 {%0, %1, %2, %3}, [%4];" : "=r"(v.x), "=r"(v.y), "=r"(v.z), "=r"(v.w) : "r"(from));
+    return v;
+}
+
+// Loads 16 bytes of a matrix, for which nothing else should leave L1, from the K-th chunk behind `from`.
+template <int K>
+__device__ __forceinline__ uint4 chunk_load(const uint4* from) {
+    uint4 v;
+    asm volatile("ld.global.nc.L1::no_allocate.v4.u32 {%0, %1, %2, %3}, [%4+%5];"
+                 : "=r"(v.x), "=r"(v.y), "=r"(v.z), "=r"(v.w) : "l"(from), "n"(512 * K));
     return v;
 }
 
@@ -91,7 +97,7 @@ __device__ __forceinline__ uint2 shared_pair_load(unsigned from, bool wanted) {
     return v;
 }
 
-// sum += a b: a of 16 rows x 16 columns, b of 16 x 8, of which two or four columns are used.
+// sum += a b: a of 16 rows x 16 columns, b of 16 x 8, of which four columns are used.
 __device__ __forceinline__ void multiply_add(float sum[4], unsigned a0, unsigned a1, unsigned a2, unsigned a3, unsigned b0, unsigned b1) {
 #if __CUDA_ARCH__ >= 800
     asm("mma.sync.aligned.m16n8k16.row.col.f32.f16.f16.f32 {%0, %1, %2, %3}, {%4, %5, %6, %7}, {%8, %9}, {%0, %1, %2, %3};"
@@ -193,8 +199,7 @@ struct PartitionedInverse {
         residual = body.residual; product = body.product; z = body.z;
         formed = body.formed; solved = body.solved; contributed = body.contributed;
 #ifdef ALONE
-        words(residual, 2 * (size + PADDING), arena);
-        words(product, size + PADDING, arena);
+        words(residual, size + PADDING, arena);
         words(z, size + PADDING, arena);
         words(solved, size + PADDING, arena);
         words(contributed, plan->contributions, arena);
@@ -255,7 +260,11 @@ struct PartitionedInverse {
             for (int k = 0; k < N; ++k) {
                 const int i = segments[min(at + k * WARPS, last - 1)].from + lane;
                 r[k] = from.r[i].load();
+#ifdef ALONE  // there is no update to be applied
+                q[k] = r[k];
+#else
                 q[k] = product[i].load();
+#endif
             }
             all = true;
 #pragma unroll
@@ -359,6 +368,23 @@ struct PartitionedInverse {
             if (at + k * WARPS < last) put_halves(vector, segments[at + k * WARPS].to + entry_place(lane), unit * v[k]);
     }
 
+    // Address of what this lane has of the vector's first 32 entries from x on.
+    __device__ __forceinline__ unsigned vector_address(int x) const {
+        const int lane = threadIdx.x % 32;
+        return shared_address((lane & 4 ? vector.low : vector.high) + x + 8 * (lane % 4) + (lane & 8 ? 4 : 0));
+    }
+
+    // Row `lane` (of sixteen) of what a warp has summed up, in lanes 0 to 15.
+    static __device__ __forceinline__ float row_of(const float sum[2][4]) {
+        const int lane = threadIdx.x % 32;  // lanes 4 r, 4 r + 1 have halves of row r, the two behind them of row r + 8
+        const bool lower = lane & 2;
+        const float first = (lower ? sum[1][0] : sum[0][0]) + (lower ? sum[1][1] : sum[0][1]) / LOW;
+        const float second = (lower ? sum[1][2] : sum[0][2]) + (lower ? sum[1][3] : sum[0][3]) / LOW;
+        float part = lane & 1 ? second : first;
+        part += __shfl_xor_sync(ALL, part, 1);
+        return __shfl_sync(ALL, part, 4 * (lane % 8) + (lane & 8 ? 2 : 0));
+    }
+
 #ifdef ALONE
     // Chunks of a tile on their way to a warp: of its upper eight rows, and of its lower ones.
     struct Group {
@@ -369,10 +395,10 @@ struct PartitionedInverse {
         bool last;            // of a plane
     };
 
-    // The groups of a warp, one after another through all phases: three of them are on their way while one is multiplied, also from one
-    // phase to the next.
+    // The groups of a warp, one after another through all phases: UNDER_WAY of them are on their way while one is multiplied, also
+    // from one phase to the next.
     struct Stream {
-        Group group[3];
+        Group group[UNDER_WAY];
         int turn, phase, job, plane, at;
     };
 
@@ -380,10 +406,20 @@ struct PartitionedInverse {
         s.turn = s.phase = s.plane = s.at = 0;
         s.job = threadIdx.x / 32;
 #pragma unroll
-        for (int n = 0; n < 3; ++n) {
+        for (int n = 0; n < UNDER_WAY; ++n) {
 #pragma unroll
             for (int k = 0; k < CHUNKS_AT_ONCE; ++k) s.group[n].upper[k] = s.group[n].lower[k] = make_uint4(0, 0, 0, 0);
             ask(s, s.group[n]);
+        }
+    }
+
+    template <int K>
+    static __device__ __forceinline__ void far_chunks(Group& g, const uint4* upper, const uint4* lower) {
+        if constexpr (K < CHUNKS_AT_ONCE) {
+            if (K >= g.count) return;
+            g.upper[K] = chunk_load<K>(upper);
+            g.lower[K] = chunk_load<K>(lower);
+            far_chunks<K + 1>(g, upper, lower);
         }
     }
 
@@ -409,13 +445,8 @@ struct PartitionedInverse {
                     g.lower[k] = shared_vector_load(b + 512 * k);
                 }
         } else {
-            const uint4 *a = matrix + 32ll * from + lane, *b = a + 32 * second;
-#pragma unroll
-            for (int k = 0; k < CHUNKS_AT_ONCE; ++k)
-                if (k < g.count) {
-                    g.upper[k] = __ldg(a + 32 * k);
-                    g.lower[k] = __ldg(b + 32 * k);
-                }
+            const uint4* a = matrix + (32 * from + lane);
+            far_chunks<0>(g, a, a + 32 * second);
         }
         s.at += CHUNKS_AT_ONCE;
         g.last = s.at >= tile.chunks;
@@ -438,26 +469,22 @@ struct PartitionedInverse {
         float sum[2][4] = {}, total = 0, weight = 1;
         double zr = 0;
         auto take = [&](Group& g) {
-            const unsigned half = shared_address((lane & 4 ? vector.low : vector.high) + g.x + 8 * (lane % 4));
-            uint4 v[CHUNKS_AT_ONCE];  // of its eight columns two are used: what the other lanes load does not matter
+            const unsigned from_here = vector_address(g.x);
+            uint2 v[CHUNKS_AT_ONCE];  // zero behind the last chunk, where one of an earlier group is left
 #pragma unroll
-            for (int k = 0; k < CHUNKS_AT_ONCE; ++k) v[k] = shared_vector_load(half + 64 * min(k, g.count - 1));
+            for (int k = 0; k < CHUNKS_AT_ONCE; ++k) v[k] = shared_pair_load(from_here + 64 * k, k < g.count);
 #pragma unroll
-            for (int k = 0; k < CHUNKS_AT_ONCE; ++k)
-                if (k < g.count) {
-                    const uint4 m = g.upper[k], n = g.lower[k];
-                    multiply_add(sum[0], m.x, n.x, m.y, n.y, v[k].x, v[k].y);
-                    multiply_add(sum[1], m.z, n.z, m.w, n.w, v[k].z, v[k].w);
-                }
+            for (int k = 0; k < CHUNKS_AT_ONCE; ++k) {
+                const uint4 m = g.upper[k], n = g.lower[k];
+                multiply_add(sum[0], m.x, m.y, m.z, m.w, v[k].x, v[k].y);
+                multiply_add(sum[1], n.x, n.y, n.z, n.w, v[k].x, v[k].y);
+            }
             const bool last = g.last;
             const int rows = g.rows, i = g.out;
             const float d = g.scale;
             ask(s, g);
             if (!last) return;
-            const float above = sum[0][0] + sum[1][0] + (sum[0][1] + sum[1][1]) / LOW;  // lane 4 r: row r
-            const float below = sum[0][2] + sum[1][2] + (sum[0][3] + sum[1][3]) / LOW;  // and row r + 8
-            const float one = __shfl_sync(ALL, above, 4 * (lane % 8)), two = __shfl_sync(ALL, below, 4 * (lane % 8));
-            total += weight * (lane & 8 ? two : one);
+            total += weight * row_of(sum);
             weight /= LOW;
             for (int k = 0; k < 4; ++k) sum[0][k] = sum[1][k] = 0;
             if (rows == 0) return;
@@ -472,10 +499,7 @@ struct PartitionedInverse {
             solved[i].put(value, number);
             z[i].put(d * value, number);
             if (d == 0) return;  // padding
-            float ri, qi = 0;
-            from.r[i].get(ri, from.r_number);
-            if (from.alpha != 0) product[i].get(qi, from.q_number);
-            zr += (double)value * (ri - from.alpha * qi);
+            zr += (double)value * from.r[i].value;
         };
         for (;;) {
             if (s.turn == 0) {
@@ -488,33 +512,18 @@ struct PartitionedInverse {
                 if (s.group[1].phase != phase) break;
                 take(s.group[1]);
                 __syncwarp();
-                s.turn = 2;
+                s.turn = UNDER_WAY > 2 ? 2 : 0;
             }
-            if (s.group[2].phase != phase) break;
-            take(s.group[2]);
-            __syncwarp();
-            s.turn = 0;
+            if constexpr (UNDER_WAY > 2) {
+                if (s.group[2].phase != phase) break;
+                take(s.group[2]);
+                __syncwarp();
+                s.turn = 0;
+            }
         }
         return zr;
     }
 #else
-    // Address of what this lane has of the vector's first 32 entries from x on.
-    __device__ __forceinline__ unsigned vector_address(int x) const {
-        const int lane = threadIdx.x % 32;
-        return shared_address((lane & 4 ? vector.low : vector.high) + x + 8 * (lane % 4) + (lane & 8 ? 4 : 0));
-    }
-
-    // Row `lane` (of sixteen) of what a warp has summed up, in lanes 0 to 15.
-    static __device__ __forceinline__ float row_of(const float sum[2][4]) {
-        const int lane = threadIdx.x % 32;  // lanes 4 r, 4 r + 1 have halves of row r, the two behind them of row r + 8
-        const bool lower = lane & 2;
-        const float first = (lower ? sum[1][0] : sum[0][0]) + (lower ? sum[1][1] : sum[0][1]) / LOW;
-        const float second = (lower ? sum[1][2] : sum[0][2]) + (lower ? sum[1][3] : sum[0][3]) / LOW;
-        float part = lane & 1 ? second : first;
-        part += __shfl_xor_sync(ALL, part, 1);
-        return __shfl_sync(ALL, part, 4 * (lane % 8) + (lane & 8 ? 2 : 0));
-    }
-
     // Chunks of all tiles of a phase, side by side; which of them a warp has: [share(w, total), share(w + 1, total)).
     __device__ __forceinline__ int chunks_of(int first, int count) const {
         return count > 0 ? tiles[first + count - 1].before + tiles[first + count - 1].chunks : 0;
