@@ -735,6 +735,19 @@ def test_a_factor_that_is_never_posted_holds_up_none_after_it(many):
     assert [box.posted for box in boxes] == [20 + body for body in range(len(boxes))]
 
 
+def test_a_factor_that_is_never_posted_is_replaced_by_one_that_is_checked_alone(many):
+    """Its job was over when its check had ended: nobody drops it, and nobody waits for that."""
+    maker, upload, boxes = many
+    upload.prepare_many(given(boxes, 10))
+    maker.thread.submit(lambda: None).result()
+    assert upload.may_prepare(0)
+    values, applied = prepared(upload, 5)
+    np.testing.assert_array_equal(applied.result(30), R / 5)
+    maker.thread.submit(lambda: None).result()
+    upload.post(0, PATTERN, values, 5)
+    assert [box.posted for box in boxes] == [5, *[0] * (len(boxes) - 1)] and len(maker.storages) == len(boxes)
+
+
 def test_few_are_not_prepared(many):
     maker, upload, boxes = many
     upload.prepare_many(given(boxes, 10)[:-2])

@@ -170,7 +170,12 @@ class BodyUploads:
     @property
     def free(self) -> bool:
         """True if a build may begin: a storage is free, or will be made."""
-        return self.posted is None and self.leaving is None and self.building is None and self.built is None
+        return self.built is None and self.may_replace
+
+    @property
+    def may_replace(self) -> bool:
+        """True if a build may begin once what is prepared is dropped."""
+        return self.posted is None and self.leaving is None and self.building is None
 
     @property
     def comes(self) -> bool:
@@ -245,10 +250,11 @@ class FactorUpload:
         return applied
 
     def may_prepare(self, body: int) -> bool:
-        """True if the inverse of another factor would be begun at once."""
+        """True if the inverse of another factor would be begun at once. One that is prepared is in nobody's way: it may
+        be of a job that ended meanwhile, and is never posted then, nor dropped before another one takes its place."""
         with self._lock:
             self._refresh(body)
-            return self._uploads[body].free and self._uploads[body].queued is None
+            return self._uploads[body].may_replace and self._uploads[body].queued is None
 
     def drop(self, body: int, values: NDArray[Any] | DeviceValues) -> None:
         """Gives up a factor that was prepared and not posted; any other one is let alone."""
