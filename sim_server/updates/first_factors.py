@@ -104,8 +104,8 @@ class FirstFactors:
                 self._failures[state.body.name] = state.failures.in_a_row
 
     def _job(self, state: BodyUpdateState) -> Job:
-        """Returns the job of a matrix; with a copy if it may share a message: it is read when that leaves, and once more
-        to check the factor, which may be after this step has gone on without, and the next step makes it anew."""
+        """Returns the job of a matrix; with a copy if it may share a message: it is read when that leaves, and again to
+        check the factor. Both may be after this step has gone on without, and the next step makes the matrix anew."""
         job = self._driver.assembled_job(state)
         if job.values.nbytes <= SMALL:
             job = replace(job, values=job.values.copy()[:])  # a view is not recycled

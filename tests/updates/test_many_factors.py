@@ -216,7 +216,7 @@ def test_those_that_are_good_are_made_ready_where_they_are_checked_and_dropped_i
 
 
 def test_what_comes_while_others_are_adopted_is_adopted_later_as_it_came(monkeypatch):
-    """It would be checked once more, one by one: `poll` returns the factors of all that has come, in messages or not."""
+    """It would be checked once more, one by one: `poll` returns factors of messages, too."""
     driver, source = start()
     first = checked_as_they_come(source, made(driver).of(range(2)))
     later = checked_as_they_come(source, made(driver).of(range(2, BODIES)))
