@@ -7,6 +7,17 @@
 
 #ifdef __CUDACC_RTC__
 
+// Rows of each warp on their way, of any of its arrays: less shared memory than one for each leaves room for more thread blocks and for the cache.
+__shared__ double staging[(BLOCK_ITEMS + 31) / 32][32 * 17];
+
+template <class T, int N> INLINE T* staged_rows() {
+    if constexpr (N * sizeof(T) <= sizeof staging[0]) return (T*)staging[threadIdx.x >> 5];
+    else {
+        __shared__ T large[(BLOCK_ITEMS + 31) / 32][N];
+        return large[threadIdx.x >> 5];
+    }
+}
+
 // Number of threads of this warp that have an item; they are the first ones.
 INLINE int companions(int i, int n) {
     int lane = threadIdx.x & 31, most = BLOCK_ITEMS < 32 ? BLOCK_ITEMS : 32, left = n - (i - lane);
@@ -17,10 +28,9 @@ INLINE int companions(int i, int n) {
 template <int K, class T>
 INLINE void put_row(T* a, int i, int n, const T (&row)[K]) {
     constexpr int STRIDE = K | 1;  // odd: no two threads in one bank
-    __shared__ T staged[(BLOCK_ITEMS + 31) / 32][32 * STRIDE];
     int lane = threadIdx.x & 31, count = companions(i, n);
     unsigned warp = count == 32 ? 0xffffffffu : (1u << count) - 1;
-    T* mine = staged[threadIdx.x >> 5];
+    T* mine = staged_rows<T, 32 * STRIDE>();
     __syncwarp(warp);
     for (int k = 0; k < K; ++k) mine[STRIDE * lane + k] = row[k];
     __syncwarp(warp);
@@ -34,6 +44,7 @@ INLINE void put_row(T* a, int i, int n, const T (&row)[K]) {
     } else {
         for (int k = lane; k < K * count; k += count) first[k] = mine[STRIDE * (k / K) + k % K];
     }
+    __syncwarp(warp);  // what another thread has written of its row is there
 }
 
 // Nine entries from place 9 * `place` on, for all items of a warp at once.
@@ -112,6 +123,10 @@ template <int FIRST, class T, class P, class N, int K> INLINE int put_wide(T*, c
 // Row after row: the entries of a row are neighbours in memory, those of a vector are not.
 template <int K, class T, class N>
 INLINE void put_row(T* a, index i, int, const N (&row)[K]) {
+    if constexpr (K < 4) {
+        for (int k = 0; k < K; ++k) put(a, K * i + k, row[k]);
+        return;
+    }
     long long place[LANES];
     UNROLL for (int l = 0; l < LANES; ++l) place[l] = (long long)K * lane(i, l);
     const int done = put_wide<0>(a, place, row);

@@ -41,5 +41,6 @@ KERNEL(extrapolate, Extrapolate) {
     }
     auto finite = dot(sum, zero) == 0;
     put_row(p.differences, i, p.n, row);
-    store3(p.guess, i, select(finite, dv + reciprocal(total) * sum, dv));
+    vec3 guess = select(finite, dv + reciprocal(total) * sum, dv);
+    put_row(p.guess, i, p.n, {guess.x, guess.y, guess.z});
 }

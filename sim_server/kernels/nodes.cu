@@ -136,8 +136,10 @@ KERNEL(advance, Advance) {
     vec3 y = load3(p.y, i), dv = mul(as<number>(load9(p.rotation, i)), y), before = load3(p.v, i), v = before + dv, zero = {};
     vec3 x = load3(p.x, i);
     auto refused = y.x != y.x, known = dot(before, zero) == 0;
+    vec3 after = x + p.h * select(refused, select(known, -before, zero), v);
+    v = select(refused, zero, v);
     store3(p.dv, i, select(refused, zero, dv));
-    store3(p.v, i, select(refused, zero, v));
-    store3(p.x, i, x + p.h * select(refused, select(known, -before, zero), v));
-    store3(p.before, i, x);
+    put_row(p.v, i, p.n, {v.x, v.y, v.z});
+    put_row(p.x, i, p.n, {after.x, after.y, after.z});
+    put_row(p.before, i, p.n, {x.x, x.y, x.z});
 }
