@@ -284,11 +284,19 @@ class FactorUpload:
         given = self._prepared(body, values)
         if given is None:
             return False
-        given.wanted = True
+        self._want(uploads, given)
         if uploads.built is not None and uploads.built[1] is given:
             (factor, _), uploads.built = uploads.built, None
             self._post(body, given, factor)
         return True
+
+    def _want(self, uploads: BodyUploads, given: GivenFactor) -> None:
+        """Has a prepared factor used. One that waits was posted before, while this one was built: it is older."""
+        given.wanted = True
+        waits = uploads.queued
+        if waits is not None and waits is not given and waits.wanted:
+            waits.drop()
+            uploads.queued = None
 
     def _enqueue(self, body: int, given: GivenFactor) -> None:
         """Puts a factor in the place of the one that waits, or that waits to be posted."""
@@ -325,7 +333,7 @@ class FactorUpload:
                     self._enqueue(body, GivenFactor(pattern, values, step))
                     waiting[body] = None
                     continue
-                prepared.wanted = True
+                self._want(uploads, prepared)
                 if uploads.built is not None and uploads.built[1] is prepared:
                     built.append((body, prepared, uploads.built[0]))
                     uploads.built = None
