@@ -48,13 +48,11 @@ class Decoding(NamedTuple):
 class DecodedTogether(NamedTuple):
     """Factors of one message.
 
-    seconds: time of each factorization [s], by the worker
     matrix_shared: matrices travelled in shared memory
     duration: from matrix to factor of each [s]
     """
 
     jobs: Sequence[InFlightJob]
-    seconds: Sequence[float]
     matrix_shared: bool
     duration: float
 
@@ -136,8 +134,7 @@ class FactorIntake:
         duration = self._duration(answers[0][1]) / len(message.jobs)
         self._note_answer(message.worker)
         good = [(place, job) for place, job in answers if not self._ends(message, place, job)]
-        seconds = [message.seconds[place] for place, _ in good]
-        together = DecodedTogether([job for _, job in good], seconds, message.matrix_shared, duration)
+        together = DecodedTogether([job for _, job in good], message.matrix_shared, duration)
         decode: Callable[[], DecodedFactors] = partial(self._all_decoded, message, good)
         if 4 * sum(message.nonzeros) <= LARGE_MESSAGE:
             return self._guarded(together.jobs, partial(self._take_together, together, decode))

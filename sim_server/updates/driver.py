@@ -221,10 +221,12 @@ class Driver:
         patterns that factors will have."""
         self._end_checks()
         self.expect_factors(source)
-        for together in source.poll_together() if self.policy.free else ():
-            self._many.adopt(together)
+        together = source.poll_together() if self.policy.free else []
+        alone = source.poll()  # at once: what comes while others are adopted would be among these, one by one
+        for each in together:
+            self._many.adopt(each)
         behind, self._behind = self._behind, []
-        if factors := [*behind, *source.poll()]:
+        if factors := [*behind, *alone]:
             on_factors(factors)
         for name, reason in source.failures():
             self.fail(name, reason)

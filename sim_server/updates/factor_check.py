@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Checks a factor before it is used: one application to a fixed vector, in the service thread.
+"""Checks a factor before it is used: one application to a fixed vector, beside the steps.
 
 With z = P^-1 r the first iteration of conjugate gradients takes (z.r)^2 / (z.Az) off e.Ae, the energy of the error
 (Saad, Iterative Methods for Sparse Linear Systems, 2nd edition, 5.3.1), whatever scale P has. An exact factor takes off

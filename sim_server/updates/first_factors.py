@@ -98,10 +98,19 @@ class FirstFactors:
                 del self._failures[name]
         unsent = [state for name, state in self._waiting.items() if name not in self._failures]
         chosen = sorted(unsent, key=lambda state: state.body.first - state.body.last)[: source.ready()]
-        sent = source.submit_many([_lasting(driver.assembled_job(state)) for state in chosen])
+        sent = source.submit_many([self._job(state) for state in chosen])
         for state, taken in zip(chosen, sent, strict=True):
             if taken:
                 self._failures[state.body.name] = state.failures.in_a_row
+
+    def _job(self, state: BodyUpdateState) -> Job:
+        """Returns the job of a matrix; with a copy if it may share a message: it is read when that leaves, and again to
+        check the factor. Both may be after this step has gone on without, and the next step makes the matrix anew."""
+        job = self._driver.assembled_job(state)
+        if job.values.nbytes <= SMALL:
+            job = replace(job, values=job.values.copy()[:])  # a view is not recycled
+            state.job.matrix = job.step, job.values
+        return job
 
     def _leave(self, state: BodyUpdateState) -> None:
         """Leaves the job of a body that is under way to the policy, as one that it has sent."""
@@ -111,12 +120,6 @@ class FirstFactors:
             step, values = state.job.matrix
             state.job.matrix = step, values.copy()[:]  # the next step assembles anew; a view is not recycled
             state.job.in_flight, state.job.sent = True, step
-
-
-def _lasting(job: Job) -> Job:
-    """Returns the job with a copy of its values if it may share a message: they are read when that leaves, which may be
-    after this step has gone on without its factor, and the next step makes them anew."""
-    return replace(job, values=job.values.copy()) if job.values.nbytes <= SMALL else job
 
 
 def few(missing: list[str]) -> str:

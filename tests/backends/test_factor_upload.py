@@ -735,6 +735,47 @@ def test_a_factor_that_is_never_posted_holds_up_none_after_it(many):
     assert [box.posted for box in boxes] == [20 + body for body in range(len(boxes))]
 
 
+def test_a_factor_that_is_never_posted_is_replaced_by_one_that_is_checked_alone(many):
+    """Its job was over when its check had ended: nobody drops it, and nobody waits for that."""
+    maker, upload, boxes = many
+    upload.prepare_many(given(boxes, 10))
+    maker.thread.submit(lambda: None).result()
+    assert upload.may_prepare(0)
+    values, applied = prepared(upload, 5)
+    np.testing.assert_array_equal(applied.result(30), R / 5)
+    maker.thread.submit(lambda: None).result()
+    upload.post(0, PATTERN, values, 5)
+    assert [box.posted for box in boxes] == [5, *[0] * (len(boxes) - 1)] and len(maker.storages) == len(boxes)
+
+
+@pytest.mark.parametrize("alone", [False, True])
+def test_what_is_posted_while_newer_ones_are_prepared_does_not_come_behind_them(many, alone):
+    """The check of the older ones may end later: it waits for the one under way."""
+    maker, upload, boxes = many
+    go, build = threading.Event(), maker.build_many
+
+    def slow(*arguments: Any) -> list[PartitionedInverse]:
+        assert go.wait(30)
+        return build(*arguments)
+
+    maker.build_many = slow
+    upload.prepare_many(newer := given(boxes, 20))
+    for factors in (given(boxes, 10), newer):
+        if alone:
+            for each in factors:
+                upload.post(*each)
+        else:
+            upload.post_many(factors)
+    go.set()
+    for _ in range(3):
+        maker.thread.submit(lambda: None).result()
+        upload.advance()
+        for box in boxes:
+            box.taken = True
+    assert [box.posted for box in boxes] == [20 + body for body in range(len(boxes))]
+    assert [box.count for box in boxes] == [1] * len(boxes)
+
+
 def test_few_are_not_prepared(many):
     maker, upload, boxes = many
     upload.prepare_many(given(boxes, 10)[:-2])

@@ -6,6 +6,7 @@ import pytest
 
 from protocol.factor import Factor
 from sim_server.backends.base import Due
+from sim_server.backends.factors_together import FactorsTogether
 from sim_server.simulation import Simulation
 from sim_server.updates.driver import Driver
 from sim_server.updates.factor_source import Inline, Job
@@ -129,6 +130,32 @@ def test_a_job_that_is_still_read_after_the_time_out_is_of_the_first_matrix() ->
     before = job.values.copy()
     driver.advance(3)
     assert step == 0 and np.array_equal(job.values, before) and np.array_equal(matrix, before)
+    assert not np.array_equal(driver.engine.factor_matrix(1), before), "or it shows nothing"
+
+
+def test_a_check_that_lasts_longer_than_the_time_out_is_of_the_first_matrix(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Factors of messages are checked in a thread of their own, with what was sent."""
+    sim = simulation(*BODIES, gravity=GRAVITY, preconditioner="cholesky")
+    workers, begun = Workers(sim), []
+    monkeypatch.setattr(workers, "check_with", begun.append, raising=False)
+    driver, workers.held = Driver(sim, workers), True
+    time, checks, seen = Time(), [], []
+
+    def sleep(seconds: float) -> None:
+        if workers.jobs and not checks:
+            checks.append(begun[0]([("b", 0)]))
+        time.sleep(seconds)
+
+    assert FirstFactors(driver, time.clock, sleep).run()
+    (job,) = workers.jobs
+    before = job.values.copy()
+    driver.advance(3)
+    monkeypatch.setattr(driver.check, "reject_together", lambda factors, matrices: seen.extend(matrices) or [""])
+    (factor,) = workers._done
+    one = FactorsTogether(
+        factor.pattern, "w", "cholesky", ["b"], [1], [0], [True], [factor.values], [1e-3], [""]
+    )  # fmt: skip
+    assert checks[0](one) == [""] and np.array_equal(seen[0], before)
     assert not np.array_equal(driver.engine.factor_matrix(1), before), "or it shows nothing"
 
 

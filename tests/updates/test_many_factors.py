@@ -215,6 +215,26 @@ def test_those_that_are_good_are_made_ready_where_they_are_checked_and_dropped_i
     assert dropped == [(7, later.steps[7])]
 
 
+def test_what_comes_while_others_are_adopted_is_adopted_later_as_it_came(monkeypatch):
+    """It would be checked once more, one by one: `poll` returns factors of messages, too."""
+    driver, source = start()
+    first = checked_as_they_come(source, made(driver).of(range(2)))
+    later = checked_as_they_come(source, made(driver).of(range(2, BODIES)))
+    adopt, alone = driver._many.adopt, []
+
+    def slow(factors: FactorsTogether) -> None:
+        adopt(factors)
+        if factors is first:
+            source.together.append(later)
+
+    monkeypatch.setattr(driver._many, "adopt", slow)
+    monkeypatch.setattr(source, "poll", lambda: [each for factors in source.poll_together() for each in factors])
+    source.together = [first]
+    driver.receive(source, alone.extend)
+    driver.receive(source, alone.extend)
+    assert alone == [] and (driver.table.used == 1).all()
+
+
 def test_a_verdict_on_a_matrix_that_is_not_there_any_more_counts_for_nothing(monkeypatch):
     """Its memory may have been written to while it was checked: each of them is checked again, without it."""
     driver, source = start()

@@ -170,7 +170,12 @@ class BodyUploads:
     @property
     def free(self) -> bool:
         """True if a build may begin: a storage is free, or will be made."""
-        return self.posted is None and self.leaving is None and self.building is None and self.built is None
+        return self.built is None and self.may_replace
+
+    @property
+    def may_replace(self) -> bool:
+        """True if a build may begin once what is prepared is dropped."""
+        return self.posted is None and self.leaving is None and self.building is None
 
     @property
     def comes(self) -> bool:
@@ -245,10 +250,11 @@ class FactorUpload:
         return applied
 
     def may_prepare(self, body: int) -> bool:
-        """True if the inverse of another factor would be begun at once."""
+        """True if the inverse of another factor would be begun at once. One that is prepared is in nobody's way: it may
+        be of a job that ended meanwhile, and is never posted then, nor dropped before another one takes its place."""
         with self._lock:
             self._refresh(body)
-            return self._uploads[body].free and self._uploads[body].queued is None
+            return self._uploads[body].may_replace and self._uploads[body].queued is None
 
     def drop(self, body: int, values: NDArray[Any] | DeviceValues) -> None:
         """Gives up a factor that was prepared and not posted; any other one is let alone."""
@@ -278,11 +284,19 @@ class FactorUpload:
         given = self._prepared(body, values)
         if given is None:
             return False
-        given.wanted = True
+        self._want(uploads, given)
         if uploads.built is not None and uploads.built[1] is given:
             (factor, _), uploads.built = uploads.built, None
             self._post(body, given, factor)
         return True
+
+    def _want(self, uploads: BodyUploads, given: GivenFactor) -> None:
+        """Has a prepared factor used. One that waits was posted before, while this one was built: it is older."""
+        given.wanted = True
+        waits = uploads.queued
+        if waits is not None and waits is not given and waits.wanted:
+            waits.drop()
+            uploads.queued = None
 
     def _enqueue(self, body: int, given: GivenFactor) -> None:
         """Puts a factor in the place of the one that waits, or that waits to be posted."""
@@ -319,7 +333,7 @@ class FactorUpload:
                     self._enqueue(body, GivenFactor(pattern, values, step))
                     waiting[body] = None
                     continue
-                prepared.wanted = True
+                self._want(uploads, prepared)
                 if uploads.built is not None and uploads.built[1] is prepared:
                     built.append((body, prepared, uploads.built[0]))
                     uploads.built = None

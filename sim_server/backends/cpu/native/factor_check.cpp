@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: MIT
-// What one application of a factor says about it, beside one of block Jacobi. For the service thread; no loop calls this.
+// What one application of a factor says about it, beside one of block Jacobi. No loop calls this.
 //
 // Factors of one pattern are applied TOGETHER at a time. In a triangle of L each number waits for the one before, which takes most of
 // the time of a small factor; those of others are worked on meanwhile. Each gets the same bits as if it were alone.
