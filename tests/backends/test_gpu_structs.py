@@ -22,7 +22,13 @@ from sim_server.backends.gpu.measured import TEXT as MEASURED_TEXT
 from sim_server.backends.gpu.momentum import MOMENTUM
 from sim_server.backends.gpu.newton import BLOCK_NODES, NEWTON, bodies_of, node_ranges
 from sim_server.backends.gpu.rosenbrock import DECISION
-from sim_server.backends.gpu.solver_layout import threads_alone, threads_and_blocks
+from sim_server.backends.gpu.solver_layout import (
+    DECLARED,
+    DECLARED_CORRECTED,
+    DECLARED_WARPS,
+    threads_alone,
+    threads_and_blocks,
+)
 from sim_server.backends.gpu.step_sequence import EPILOGUE
 from sim_server.backends.gpu.structs import PCG
 from tests.support import nvrtc
@@ -97,6 +103,24 @@ def test_the_solver_spills_no_registers(threads, blocks, more):
     spilled = [int(n) for n in re.findall(r"(\d+) bytes (?:stack frame|spill stores|spill loads)", said)]
     most = 96 if "-DALONE" in more else 32  # of what lives through an iteration
     assert code and spilled and max(spilled) <= most, said
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("threads", "features"),
+    [(256, "NEWTON_PHASES ERRORS BUDGETS CUTS SPLITS"), (256, "CORRECTED NEWTON_PHASES ERRORS BUDGETS CUTS HELPED"),
+     (512, "ALONE ERRORS BUDGETS"), (512, "ALONE CORRECTED CONTACT_PASSES ERRORS")],
+)  # fmt: skip
+def test_the_solver_declares_no_more_shared_memory_than_is_kept_for_it(threads, features):
+    """Of scenes whose solves do most: a launch with more would be refused."""
+    if (library := nvrtc.library()) is None:
+        pytest.skip("needs the package nvidia-cuda-nvrtc")
+    options = [*device_options(PRECISIONS["float64"]), *own_headers(), "--ptxas-options=-v", "-arch=sm_90"]
+    options += [f"-DTHREADS={threads}", "-DPER_PROCESSOR=1", *(f"-D{feature}" for feature in features.split())]
+    code, said = nvrtc.compiled(library, SOURCES / "backends/gpu/pcg.cu", options)
+    declared = [int(n) for n in re.findall(r"(\d+) bytes smem", said)]
+    kept = DECLARED_CORRECTED if "CORRECTED" in features else DECLARED
+    assert code and declared and max(declared) <= kept + (DECLARED_WARPS if threads > 256 else 0), said
 
 
 def test_bodies_of_which_half_of_a_does_not_fit_get_more_warps():
