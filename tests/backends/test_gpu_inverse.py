@@ -23,7 +23,8 @@ from tests.reference.partitioned import stored
 from tests.solver.test_partitioned_inverse import system
 from tests.worker.block_matrices import bar_edges, pattern
 
-THREADS = 128
+THREADS = {"several": 128, "alone": 128, "alone, of sixteen warps": 512}
+"""Of a thread block."""
 PARTS = """
 #include "partitioned_inverse.cuh"
 extern "C" void apply(const PcgBody* body, const DevicePlan* plan, float alpha, float unit, int shared, double* zr) {
@@ -117,7 +118,7 @@ static void matrix_product(float sum[4], unsigned a0, unsigned a1, unsigned a2, 
 """
 
 
-def compiled(folder: Path, *defined: str) -> c.CDLL:
+def compiled(folder: Path, form: str) -> c.CDLL:
     gpu = SOURCES / "backends/gpu"
     group, inverse = (gpu / "block_group.cuh").read_text(), (gpu / "inverse/partitioned_inverse.cuh").read_text()
     for pattern_, plain in WORDS:
@@ -132,7 +133,8 @@ def compiled(folder: Path, *defined: str) -> c.CDLL:
         (folder / name).write_text(text)
     (folder / "inverse.cpp").write_text(f'#include "cuda_threads.h"\n{MORE}{MATRIX}{PARTS}')
     paths = [f"-I{p}" for p in (folder, TESTS / "backends", gpu, INCLUDE)]
-    words = [f"-D{d}" for d in ("real=double", f"THREADS={THREADS}", "PER_PROCESSOR=1", *defined)]
+    alone = [] if form == "several" else ["ALONE"]
+    words = [f"-D{d}" for d in ("real=double", f"THREADS={THREADS[form]}", "PER_PROCESSOR=1", *alone)]
     command = [compiler(), "-std=c++20", "-O1", "-shared", "-fPIC", "-w", *words, *paths]
     subprocess.run([*command, str(folder / "inverse.cpp"), "-o", str(folder / "inverse.so")], check=True)
     library = c.CDLL(str(folder / "inverse.so"))
@@ -152,8 +154,10 @@ class Host:
             return SimpleNamespace(data=SimpleNamespace(ptr=kept.ctypes.data), host=kept)
 
 
-def applied(library: c.CDLL, p: Plan, s: Any, shared: int, alone: bool, alpha: float) -> tuple[NDArray, float]:
-    """z of r - alpha q, and z . r."""
+def applied(library: c.CDLL, form: str, p: Plan, s: Any, shared: int) -> tuple[NDArray, float]:
+    """z of r - alpha q, and z . r. alpha: 0 where d r is there after the update alone"""
+    alone = form != "several"
+    alpha = 0.0 if alone else 0.5
     device = DevicePlan(Host, p)  # type: ignore[arg-type]
     chunks, scale = stored(s.pattern, s.factor, p, np.float16)
     scale = scale.astype(np.float32)
@@ -184,21 +188,21 @@ def applied(library: c.CDLL, p: Plan, s: Any, shared: int, alone: bool, alpha: f
     for name, array in {"matrix": matrix, "scale": scale, **vectors}.items():
         body[name] = array.ctypes.data
     body["blocks"], body["planes"] = p.blocks, p.planes
-    zr = np.zeros(p.blocks * THREADS)
+    zr = np.zeros(p.blocks * THREADS[form])
     unit = 2.0 ** -int(np.ceil(np.log2(np.abs(scale[at] * s.r).max() + 1)))
     library.apply(body.ctypes.data, device.address, alpha, unit, shared, zr.ctypes.data)
     z = vectors["z"]
     return (z if alone else z["value"])[at].astype(float), float(zr.sum())
 
 
-@pytest.fixture(scope="module", params=["several", "alone"])
+@pytest.fixture(scope="module", params=list(THREADS))
 def form(request):
     return request.param
 
 
 @pytest.fixture(scope="module")
 def library(form, tmp_path_factory):
-    return compiled(tmp_path_factory.mktemp("inverse"), *(["ALONE"] if form == "alone" else []))
+    return compiled(tmp_path_factory.mktemp("inverse"), form)
 
 
 @pytest.fixture(scope="module")
@@ -210,12 +214,23 @@ def problem():
 @pytest.mark.parametrize("planes", [1, 2])
 @pytest.mark.parametrize("groups", [1, 3])
 def test_z_is_that_of_numpy(library, form, problem, groups, planes, near):
-    s, alone = problem, form == "alone"
-    tree = tree_of(s.pattern)
+    s, tree = problem, tree_of(problem.pattern)
     sizes = np.unique(tree.size).tolist()
     thresholds = tuple(sizes[k * len(sizes) // groups] for k in range(1, groups))
-    p = lay_out(tree, thresholds, 1 if alone else 3, planes)
-    z, zr = applied(library, p, s, 120_000 if near else 30_000, alone, 0 if alone else 0.5)
-    within = 2e-3 if planes == 1 else 3e-6
+    p = lay_out(tree, thresholds, 3 if form == "several" else 1, planes)
+    check(library, form, p, s, 120_000 if near else 30_000)
+
+
+@pytest.mark.parametrize("graph", [(1, []), (30, []), (2 * 2 * 5, bar_edges(1, 1, 4))], ids=["node", "apart", "bar"])
+def test_thread_blocks_and_warps_may_have_nothing_to_do(library, form, graph):
+    """Of bodies with fewer chunks than warps, and fewer tiles than thread blocks."""
+    nodes, edges = graph
+    s = system(pattern(nodes, np.reshape(edges, (-1, 2)).astype(int)))
+    check(library, form, lay_out(tree_of(s.pattern), (), 5 if form == "several" else 1, 2), s, 30_000)
+
+
+def check(library: c.CDLL, form: str, p: Plan, s: Any, shared: int) -> None:
+    z, zr = applied(library, form, p, s, shared)
+    within = 2e-3 if p.planes == 1 else 3e-6
     assert np.linalg.norm(z - s.z) <= within * np.linalg.norm(s.z)
     assert abs(zr - s.r @ z) <= 1e-5 * abs(s.r @ z)
