@@ -242,7 +242,7 @@ class FactorIntake:
     def _end_gone(self, job: InFlightJob) -> None:
         """Frees the worker of a job that is over, if it is still there."""
         leases = self._book.leases
-        if leases.by_worker.get(job.worker, {}).get(job.number) is job:
+        if leases.is_in_flight(job):
             if leases.is_reassigned(job):  # its parts did not come
                 self._book.reliability.on_failure(job.worker, job.object, self._book.clock())
             leases.finish(job)
@@ -277,7 +277,7 @@ class FactorIntake:
         self._counters.refuse(refusal)
         leases = self._book.leases
         for job in jobs:
-            if leases.by_worker.get(job.worker, {}).get(job.number) is job:
+            if leases.is_in_flight(job):
                 if leases.by_object.get(job.object) is job:
                     self._book.fail(job, f"was refused: {refusal}")
                 leases.finish(job)
@@ -325,7 +325,7 @@ class FactorIntake:
     def _is_current(self, job: InFlightJob) -> bool:
         """True if the factor of a job, which was decoded, is waited for."""
         leases = self._book.leases
-        if leases.by_object.get(job.object) is job and leases.by_worker.get(job.worker, {}).get(job.number) is job:
+        if leases.by_object.get(job.object) is job and leases.is_in_flight(job):
             return True
         try:
             leases.finish(leases.match_answer(job.number, job.worker, job.epoch))  # another worker has it now

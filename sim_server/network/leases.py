@@ -192,6 +192,10 @@ class Leases:
             self._reassigned.add(job.number)
         return slow
 
+    def is_in_flight(self, job: InFlightJob) -> bool:
+        """True while a job is neither answered nor given up."""
+        return self.by_worker.get(job.worker, {}).get(job.number) is job
+
     def is_reassigned(self, job: InFlightJob) -> bool:
         """True if the object of the job was freed by `reassign`."""
         return job.number in self._reassigned

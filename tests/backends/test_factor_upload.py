@@ -138,6 +138,18 @@ def parts(monkeypatch):
     return scene, maker, FactorUpload(gpu, maker, scene.loop, ["beam"], scene.loop.mailboxes[1:2])
 
 
+def held_builds(maker: Maker) -> threading.Event:
+    """Has builds of inverses wait until the event is set."""
+    go, build = threading.Event(), maker.build_many
+
+    def slow(*arguments: Any) -> list[PartitionedInverse]:
+        assert go.wait(30)
+        return build(*arguments)
+
+    maker.build_many = slow
+    return go
+
+
 def post(upload: FactorUpload, value: int) -> None:
     upload.post(0, PATTERN, np.array([value]), value)
 
@@ -293,13 +305,7 @@ def test_a_prepared_factor_is_built_and_applied_and_used_once_it_is_posted(parts
 
 def test_what_is_posted_before_it_is_built_is_used_then(parts):
     scene, maker, upload = parts
-    go, build = threading.Event(), maker.build_many
-
-    def slow(*arguments: Any) -> PartitionedInverse:
-        assert go.wait(30)
-        return build(*arguments)
-
-    maker.build_many = slow
+    go = held_builds(maker)
     values, _ = prepared(upload, 5)
     upload.post(0, PATTERN, values, 5)
     go.set()
@@ -616,13 +622,7 @@ def test_of_factors_that_come_faster_than_they_are_built_the_newest_wait(many, m
 def test_many_are_built_beside_the_caller(many):
     """Who posts them waits for no build; each goes into the mailbox of its body once it is looked at again."""
     maker, upload, boxes = many
-    go, build = threading.Event(), maker.build_many
-
-    def slow(*arguments: Any) -> list[PartitionedInverse]:
-        assert go.wait(30)
-        return build(*arguments)
-
-    maker.build_many = slow
+    go = held_builds(maker)
     values = list(range(1, len(boxes) + 1))
     assert len(values) == maker.most + 1
     post_all(upload, values)
@@ -680,13 +680,7 @@ def given(boxes: list[Mailbox], step: int) -> list[tuple[int, Any, np.ndarray, i
 @pytest.mark.parametrize("early", [True, False], ids=["posted before they are built", "after"])
 def test_many_that_were_prepared_are_built_once_and_used_when_they_are_posted(many, early):
     maker, upload, boxes = many
-    go, build = threading.Event(), maker.build_many
-
-    def slow(*arguments: Any) -> list[PartitionedInverse]:
-        assert go.wait(30)
-        return build(*arguments)
-
-    maker.build_many = slow
+    go = held_builds(maker)
     factors = given(boxes, 10)
     upload.prepare_many(factors)
     if early:
@@ -718,13 +712,7 @@ def test_of_many_that_were_prepared_what_is_dropped_or_replaced_is_not_used(many
 def test_a_factor_that_is_never_posted_holds_up_none_after_it(many):
     """It is being built when the next one comes, which waits until then."""
     maker, upload, boxes = many
-    go, build = threading.Event(), maker.build_many
-
-    def slow(*arguments: Any) -> list[PartitionedInverse]:
-        assert go.wait(30)
-        return build(*arguments)
-
-    maker.build_many = slow
+    go = held_builds(maker)
     upload.prepare_many(given(boxes, 10))
     upload.prepare_many(given(boxes, 15))  # one comes already
     upload.post_many(given(boxes, 20))
@@ -752,13 +740,7 @@ def test_a_factor_that_is_never_posted_is_replaced_by_one_that_is_checked_alone(
 def test_what_is_posted_while_newer_ones_are_prepared_does_not_come_behind_them(many, alone):
     """The check of the older ones may end later: it waits for the one under way."""
     maker, upload, boxes = many
-    go, build = threading.Event(), maker.build_many
-
-    def slow(*arguments: Any) -> list[PartitionedInverse]:
-        assert go.wait(30)
-        return build(*arguments)
-
-    maker.build_many = slow
+    go = held_builds(maker)
     upload.prepare_many(newer := given(boxes, 20))
     for factors in (given(boxes, 10), newer):
         if alone:
@@ -797,13 +779,7 @@ def test_of_several_of_one_body_among_many_the_last_one_is_used(many):
 
 def test_what_is_dropped_while_it_is_built_is_not_applied(parts, monkeypatch):
     _, maker, upload = parts
-    go, build, applications = threading.Event(), maker.build_many, []
-
-    def slow(*arguments: Any) -> list[PartitionedInverse]:
-        assert go.wait(30)
-        return build(*arguments)
-
-    monkeypatch.setattr(maker, "build_many", slow)
+    go, applications = held_builds(maker), []
     monkeypatch.setattr(maker, "apply", lambda *arguments: applications.append(arguments))
     values, applied = prepared(upload, 5)
     upload.drop(0, values)
