@@ -40,8 +40,11 @@ from sim_server.updates.useless_factors import UselessFactors
 log = logging.getLogger(__name__)
 
 LARGE = 4 << 20  # bytes of a factor whose check takes more than a few milliseconds
-CHECK_FAILED = "its check failed"  # begins the reason of a factor whose check ended in an error: no fault of its worker
 MAX_CAUSES = 20  # reasons of missing factors that are logged of an object, each once
+
+
+class CheckFailed(str):
+    """Reason of a factor whose check ended in an error: no fault of its worker."""
 
 
 class FactorsUnderCheck(NamedTuple):
@@ -310,9 +313,9 @@ class Driver:
 
     def _check_failed(self, error: Exception, factors: int) -> list[str]:
         """Counts an error of the check of some factors; returns why they are not used."""
-        refusal = self.counters.unexpected(error, CHECK_FAILED)
+        refusal = self.counters.unexpected(error, "its check failed")
         self.counters.refuse(refusal)
-        return [str(refusal)] * factors
+        return [CheckFailed(refusal)] * factors
 
     def _prepare(self, factor: Factor) -> Callable[[], Float64 | None] | None:
         """Has a large factor made ready for use while it is checked, and applied for the check."""
@@ -359,7 +362,7 @@ class Driver:
         good: list[Factor] = []
         for factor, why in zip(factors, reasons, strict=True):
             if why:
-                bad = not why.startswith(CHECK_FAILED)
+                bad = not isinstance(why, CheckFailed)
                 if bad:
                     self.useless_factors.on_rejected(factor)
                 self.fail(factor.object, f"that of {factor.worker} is not used: {why}", refused=bad, step=factor.step)

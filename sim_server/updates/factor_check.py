@@ -78,6 +78,12 @@ class CheckedBody:
         return self.row_start is row_start and self.columns is columns and self.pattern is pattern
 
 
+def _within_limits(zr: Any, reduction: Any, block_jacobi: Any, residual: Any) -> tuple[Any, Any, Any]:
+    """Returns whether a Probe, or columns of it, show a positive definite factor, one that is no worse than block
+    Jacobi, and one of its very matrix; False where a number is not one."""
+    return (zr > 0) & (zr < np.inf), reduction >= MIN_SHARE * block_jacobi, residual <= MAX_RESIDUAL
+
+
 class Checked(NamedTuple):
     """Factors that are checked, by columns. matrices: values (blocks, 3, 3) that each was made from; None: not known"""
 
@@ -156,23 +162,21 @@ class FactorCheck:
 
     def _may_be_useless(self, found: Reals) -> NDArray[np.bool_]:
         """Returns for which columns of Probe, (k, 4), `_useless` may have a reason: all others have none."""
-        zr, reduction, block_jacobi, residual = found.T
-        good = (zr > 0) & (zr < np.inf) & (reduction >= MIN_SHARE * block_jacobi)
-        if self._alone:
-            good &= residual <= MAX_RESIDUAL
-        useless: NDArray[np.bool_] = ~good
+        positive, better, exact = _within_limits(*found.T)
+        useless: NDArray[np.bool_] = ~(positive & better & exact if self._alone else positive & better)
         return useless
 
     def _useless(self, factor: Factor, matrix: Reals | None, probe: Probe) -> str:
         zr, reduction, block_jacobi, residual = probe
-        if not 0 < zr < np.inf:
+        positive, better, exact = _within_limits(*probe)
+        if not positive:
             return f"not positive definite or not finite (z.r = {zr:.3g} on a probe vector)"
-        if matrix is not None and not reduction >= MIN_SHARE * block_jacobi:
+        if matrix is not None and not better:
             return (
                 "worse than block Jacobi on a probe vector: an iteration takes "
                 f"{reduction:.3g} off the energy of the error, with block Jacobi {block_jacobi:.3g}"
             )
-        if self._alone and matrix is not None and not factor.remedy and not residual <= MAX_RESIDUAL:
+        if self._alone and matrix is not None and not factor.remedy and not exact:
             return (
                 f"not that of its matrix: it leaves {residual:.3g} of a residual, at most {MAX_RESIDUAL:g} is allowed"
             )
