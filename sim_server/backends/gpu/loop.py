@@ -16,7 +16,7 @@ from sim_server.arrays import Float64, Int64
 from sim_server.backends.base import Due
 from sim_server.backends.gpu import structs
 from sim_server.backends.gpu.mailbox import DeviceMailbox, library
-from sim_server.backends.gpu.structs import FRAME_COPIES, RECORD_TARGET
+from sim_server.backends.gpu.structs import DEVICE_COPY, FRAME_COPIES, RECORD_TARGET
 from sim_server.backends.measured import Measured
 from sim_server.backends.ring_buffers import Reports
 from sim_server.errors import DeviceLost
@@ -26,8 +26,11 @@ GRAPH_STEPS = (1, 2, 8)  # of which there are graphs
 CAPACITY = 64  # steps whose results are kept; more than can be under way
 FRAMES = 8  # in the ring
 BATCH_SECONDS = 2e-3  # aim for the duration of a batch [s]; requests wait for two batches at most
+EXCHANGE_SECONDS = 5e-4  # likewise while matrices and factors come and go
 DOUBLED = 512 << 20  # bytes of the matrices of all bodies, up to which each has two places for copies
 POLL = 1e-5  # interval between queries of an event [s]
+LEAD = 3e-4  # before the end of a batch the next one is launched then [s]
+COPY_POLL = 1e-4  # likewise of the one behind copies to the host, while their steps are over
 
 
 def places_of_copies(size: int) -> int:
@@ -92,6 +95,7 @@ class DeviceLoop(Reports):
     addresses: device addresses of values, x and v, and with contact poses (obstacles, 7) of float64
 
     targets: addresses of the RecordTarget (step_results.cuh) of each batch that may be under way
+    copy_launches: lists of copies of each of them, of mail, and the one of matrices (loop.h)
     """
 
     def __init__(
@@ -118,15 +122,14 @@ class DeviceLoop(Reports):
         self._room = [block * count for count in most]  # bytes of the blocks of each body at most
         places = places_of_copies(sum(self._room))
         self._doubled = places == 2
-        staged = np.cumsum([0, *(places * room for room in self._room)])
-        self._staged_begin = [int(begin) for begin in staged]  # of the first one of each
-        self._first_places, self._rooms = staged[:-1].astype(np.int64), np.array(self._room, np.int64)
+        staged = np.cumsum([0, *self._room])  # first places of all, and then the second ones: neighbours adjoin
+        self._first_places, self._second = staged[:-1].astype(np.int64), int(staged[-1])
         for entry, (first, last), own in zip(self._readbacks, ranges, staged, strict=False):
             begin, end = block * int(row_start[first]), block * int(row_start[last])
             entry.values_begin, entry.values_bytes, entry.copied_step = begin, end - begin, -1
             entry.staged_begin = int(own)
             entry.x_begin, entry.x_bytes = (3 * np.dtype(real).itemsize * k for k in (first, last - first))
-        self._real, self._value_bytes = np.dtype(real), int(staged[-1])
+        self._real, self._value_bytes = np.dtype(real), places * self._second
         self._targets: dict[int, Float64] = {}
         self._own_memory: dict[int, Float64] = {}  # by its place
         entries = np.ctypeslib.as_array(self._readbacks)
@@ -139,6 +142,7 @@ class DeviceLoop(Reports):
         for name, where in addresses.items():
             setattr(loop, name, where)
         loop.capacity, loop.batch, loop.batch_seconds, loop.poll = CAPACITY, BATCH, BATCH_SECONDS, POLL
+        loop.exchange_seconds, loop.lead, loop.copy_poll = EXCHANGE_SECONDS, LEAD, COPY_POLL
         loop.sizes[:] = GRAPH_STEPS
         loop.frame_bytes, loop.clock, loop.matrix_step = frame, clock.ctypes.data, -1
         loop.frame_staging = device.memory(FRAME_COPIES * 2 * frame)
@@ -159,6 +163,7 @@ class DeviceLoop(Reports):
         if held_reactions is not None:
             loop.held_reactions, loop.holders = held_reactions.ctypes.data, held_reactions.shape[2]
         self.report_reactions(loop.obstacles + loop.holders, loop.obstacles, poses)
+        assert all(size % 4 == 0 for _, size in mailboxes)  # as copy_list.cu copies
         self._pinned = self._events_and_memory(loop, sum(-(-size // 16) * 16 for _, size in mailboxes))
 
     def _events_and_memory(self, loop: structs.GpuLoop, upload: int) -> list[NDArray[np.uint8]]:
@@ -170,6 +175,12 @@ class DeviceLoop(Reports):
         for copy in loop.frame_copies:
             copy.taken, copy.arrived = self._device.event(), self._device.event()
         loop.staged_event, loop.copied_event = self._device.event(), self._device.event()
+        self.copy_launches = [*(batch.mail for batch in loop.batches), loop.matrices]
+        rooms = [max(loop.mail_slot_count, 1)] * len(loop.batches) + [loop.bodies]
+        for launch, room in zip(self.copy_launches, rooms, strict=True):
+            memory.append(self._device.pinned(room * DEVICE_COPY.itemsize + 8))
+            launch.copies = memory[-1].ctypes.data
+            launch.count = launch.copies + room * DEVICE_COPY.itemsize
         return memory + targets
 
     def report_grabs(self, graph: int, mailbox: int, reactions: NDArray[Any], counts: NDArray[Any]) -> None:
@@ -202,12 +213,14 @@ class DeviceLoop(Reports):
     # --- running ------------------------------------------------------------------------------------------------
 
     def use_graphs(
-        self, graphs: Sequence[int], records: Sequence[int], energy_balance: int, elastic_energy: int, matrix: int = 0
+        self, graphs: Sequence[int], records: Sequence[int], copies: Sequence[int], energy_balance: int,
+        elastic_energy: int, matrix: int = 0,
     ) -> None:  # fmt: skip
         """Sets the handles of the CUDA graphs.
 
         graphs: of GRAPH_STEPS (0: none), then the same beginning with the kernel that writes the time
         records: for each of `targets`, settles the energy balance of the last step and writes the records asked for
+        copies: for each of `copy_launches`, makes its copies
         energy_balance: settles the energy balance of the last step
         elastic_energy: adds the elastic energy to it
         matrix: makes A of the next step, for a copy; 0: each step makes its own
@@ -215,6 +228,8 @@ class DeviceLoop(Reports):
         self.loop.graphs[0][:], self.loop.graphs[1][:] = graphs[: len(GRAPH_STEPS)], graphs[len(GRAPH_STEPS) :]
         for batch, graph in zip(self.loop.batches, records, strict=True):
             batch.records = graph
+        for launch, graph in zip(self.copy_launches, copies, strict=True):
+            launch.graph = graph
         self.loop.energy_balance, self.loop.elastic_energy = energy_balance, elastic_energy
         self.loop.matrix = matrix
 
@@ -289,7 +304,7 @@ class DeviceLoop(Reports):
         self._copied_steps[rows] = -1
         self._requests[rows] = structs.REQUEST_VALUES  # last, as in `_request`
         self.loop.requested = 1
-        return [self._memory_at(body, place) for body, place in zip(bodies, places.tolist(), strict=True)]
+        return [self._memory_at(*each) for each in zip(rows.tolist(), places.tolist(), strict=True)]
 
     @property
     def _has_copy_memory(self) -> bool:
@@ -306,13 +321,13 @@ class DeviceLoop(Reports):
 
     def _other_place(self, body: int) -> int:
         """First byte of the place for a copy that the last one was not brought to: who has that may still read it."""
-        begin = self._staged_begin[body]
-        return begin + self._room[body] if self._staged_at[body] == begin else begin
+        begin = int(self._first_places[body])
+        return begin + self._second if self._staged_at[body] == begin else begin
 
     def _other_places(self, bodies: Int64) -> Int64:
         """Returns the same of each of some bodies."""
         begin = self._first_places[bodies]
-        places: Int64 = np.where(self._staged_at[bodies] == begin, begin + self._rooms[bodies], begin)
+        places: Int64 = np.where(self._staged_at[bodies] == begin, begin + self._second, begin)
         return places
 
     def prepare_copies(self) -> None:
@@ -349,7 +364,7 @@ class DeviceLoop(Reports):
     def matrix_steps(self, bodies: Sequence[int]) -> Int64:
         """Returns the same of each of some bodies."""
         if not self._targets:
-            steps: Int64 = self._copied_steps[list(bodies)]
+            steps: Int64 = self._copied_steps[np.asarray(bodies, np.int64)]
             return steps
         return np.array([self.matrix_step(body) for body in bodies], np.int64)
 
