@@ -298,11 +298,12 @@ static bool begin(GpuLoop& l) {
 }
 
 // Waits, while matrices and mail come and go, until the batch under way is nearly over: what comes meanwhile goes with the next one.
+// One that ends sooner than the last one did is noticed within `lead`.
 static void await_mail(GpuLoop& l) {
     if (l.begun == l.finished || !exchanges(l)) return;
     const StepBatch& under_way = l.batches[l.finished % STEP_BATCHES];
     const double due = l.idle_since + l.step_seconds * under_way.steps - l.lead;
-    for (double left; (left = due - now()) > 0 && !l.error && !done(l, under_way.done);) nap(std::min(left, publish_meanwhile(l)));
+    for (double left; (left = due - now()) > 0 && !l.error && !done(l, under_way.done);) nap(std::min({left, l.lead, publish_meanwhile(l)}));
 }
 
 // Batches that may be under way while the next one is launched. One whose records have no place leaves none to those behind it.
