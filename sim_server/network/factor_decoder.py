@@ -36,7 +36,7 @@ from protocol.validate import (
 from sim_server.arrays import Float32, Float64
 from sim_server.backends.factors_together import FactorsTogether
 from sim_server.backends.shared_memory import SharedMemory
-from sim_server.network.leases import InFlightJob
+from sim_server.network.jobs_in_flight import InFlightJob
 from sim_server.network.native_copies import native_copies
 from sim_server.scene.size_limits import expected_values
 from sim_server.updates.factor_source import FactorMemory
