@@ -77,7 +77,8 @@ class FactorUpload:
 
     def expect(self, body: int, pattern: FactorPattern) -> None:
         """Begins to plan the inverses of factors of a pattern, beside the caller. From any thread."""
-        self._inverses.expect(body, pattern.id)
+        with self._lock:
+            self._inverses.expect(body, pattern.id)
         self._solver.begin_plan(body, pattern)
 
     def post(self, body: int, pattern: FactorPattern, values: NDArray[Any] | DeviceValues, step: int) -> None:
@@ -204,7 +205,7 @@ class FactorUpload:
                 self._inverses.take_back(body)
                 self._has_room([body])
                 self._inverses.at_rest(body)
-                self._begin_queued([body], now=True)
+                self._begin_queued([body], at_once=True)
             if (builds := self._building.get(body)) is not None:
                 return builds.done
             self._has_room([body])
@@ -230,22 +231,24 @@ class FactorUpload:
         free: list[bool] = self._inverses.free(rows).tolist()
         return free
 
-    def _begin_queued(self, bodies: Sequence[int] | None = None, beside: bool = False, now: bool = False) -> None:
+    def _begin_queued(
+        self, bodies: Sequence[int] | None = None, beside: bool = False, at_once: bool | None = None
+    ) -> None:  # fmt: skip
         """Begins to build the queued factors of some bodies that need not wait: at once if they are few, small and
         planned and not `beside`, else in the thread of the plans, to which no more are given than it is about to build:
-        what waits here is replaced by what is newer. bodies: None: all. now: none waits for builds of other bodies"""
+        what waits here is replaced by what is newer. bodies: None: all. at_once: None: if they are few"""
         waiting = list(self._queued) if bodies is None else [body for body in bodies if body in self._queued]
         if not waiting:
             return
         together = sum(builds.together for builds in self._builds)
-        few, left = now or (len(waiting) < MANY and not together), TOGETHER * (AHEAD - together)
-        small: list[int] = []
+        few, left = len(waiting) < MANY and not together, TOGETHER * (AHEAD - together)
+        at_once, small = few if at_once is None else at_once, list[int]()
         for body, able in zip(waiting, self._has_room(waiting), strict=True):
             if not able or body in self._building or body in self._built:
                 continue
             if beside or self._queued[body].values.nbytes > SMALL:
                 self._begin_beside([body])
-            elif few:
+            elif at_once:
                 self._begin_now(body)
             elif len(small) < left:
                 small.append(body)
@@ -290,7 +293,7 @@ class FactorUpload:
         with self._lock:
             try:
                 self._take(made, builds)
-                self._begin_queued()
+                self._begin_queued(at_once=False)
             except Exception as error:  # for who serves the loop
                 self._errors.append(error)
             builds.done.set_result(None)
@@ -298,12 +301,14 @@ class FactorUpload:
     def _take(self, made: Made, builds: Builds | None = None) -> None:
         """Posts inverses that are wanted already, and warns of factors that cannot be used. Raises in the end what is
         neither of a factor nor lack of memory; all others are posted. builds: that they come from"""
-        for built in made.built:  # the plans of those that are being built are needed
-            self._posts.keep(built)
-        if builds is not None:
-            self._builds.remove(builds)
-            for body in builds.given:
-                del self._building[body]
+        try:
+            for built in made.built:
+                self._posts.keep(built)
+        finally:
+            if builds is not None:  # not before: the plans of those behind it are needed
+                self._builds.remove(builds)
+                for body in builds.given:
+                    del self._building[body]
         for built in made.built:
             bodies = built.bodies.tolist()
             for row, (body, given) in enumerate(zip(bodies, built.given, strict=True)):
