@@ -261,6 +261,16 @@ class Engine(Protocol):
     def post_factors(self, bodies: Sequence[int], factors: Sequence[Factor]) -> None:
         """Posts factors of different bodies, one of each. Their values do not change any more."""
 
+    def response_function(self) -> int:
+        """Address of the function that finds the largest response of factors (inverse/digits.py), for who calls it as
+        factors arrive; 0: nobody need."""
+        ...
+
+    def planes_by(self, factors: FactorsTogether, responses: Float64) -> list[int] | None:
+        """Returns how many float16 numbers an entry the inverse of each factor needs, by its largest response (k,);
+        None: not known."""
+        ...
+
     def prepare_together(self, bodies: Sequence[int], factors: FactorsTogether) -> None:
         """Makes ready what it takes to use factors of different bodies, without waiting; each is used once its values
         are posted, else it must be dropped, or is by the next one of its body. From any thread."""

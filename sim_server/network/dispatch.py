@@ -33,7 +33,8 @@ from sim_server.network.worker_choice import WorkerChoice
 from sim_server.network.worker_registry import WorkerRegistry
 from sim_server.network.worker_reliability import WorkerReliability
 from sim_server.network.worker_timing import WorkerTiming
-from sim_server.updates.factor_source import Check, FactorMemory, FactorSource, Job
+from sim_server.updates.factor_source import FactorMemory, FactorSource, Job
+from sim_server.updates.take_in import BeginCheck
 
 log = logging.getLogger(__name__)
 
@@ -196,7 +197,7 @@ class Dispatch(FactorSource):
         """Has large factors that arrive put into arrays that `memory` makes."""
         self.decoder.memory = memory
 
-    def check_with(self, begin: Callable[[Sequence[tuple[str, int]]], Check | None]) -> None:
+    def check_with(self, begin: BeginCheck) -> None:
         """Has factors of messages checked in the thread that copies them."""
         self._intake.begin_check = begin
 

@@ -14,7 +14,7 @@ from protocol.messages_pb2 import FactorBatch, Header, Topology
 from protocol.messages_pb2 import Slot as SlotMessage
 from protocol.refused import Refused
 from protocol.validate import checksum
-from sim_server.network import factor_decoder as module
+from sim_server.network import batch_decoder as module
 from sim_server.network.factor_decoder import FactorDecoder
 from sim_server.network.leases import InFlightJob
 from tests.worker.block_matrices import bar_edges, pattern, spd
@@ -85,7 +85,7 @@ def refused(stage: SimpleNamespace) -> dict[str, str]:
 
 def decoded(stage: SimpleNamespace) -> list[Factor | Refused]:
     """The factor of each answer, or why it is refused."""
-    good, refused = stage.decoder.decode_several(stage.message, stage.answers)
+    good, refused = module.decode_several(stage.decoder, stage.message, stage.answers)
     found = dict(refused)
     for places, factors in good:
         assert len(places) == len(factors) and not found.keys() & set(places)

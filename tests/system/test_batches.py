@@ -18,13 +18,15 @@ from protocol.messages_pb2 import FactorBatch, MatrixBatch
 from protocol.shared_memory.limits import obstacle
 from protocol.shared_memory.view import SlotMap
 from protocol.validate import checksum
-from sim_server.network import factor_decoder, factor_intake, job_sender, worker_choice
+from sim_server.network import batch_decoder, factor_intake, job_sender, worker_choice
 from sim_server.network.batch_message import MOST_TOGETHER
 from sim_server.network.job_sender import JobSender
 from sim_server.network.link import ServerLink
 from sim_server.network.send_queue import SendQueue
 from sim_server.network.worker_timing import WorkerTiming
+from sim_server.updates.factor_check import FactorCheck
 from sim_server.updates.factor_source import Job
+from sim_server.updates.take_in import SentMatrices
 from tests.ports import free_endpoint
 
 pytestmark = [
@@ -272,7 +274,7 @@ def test_an_error_that_no_check_foresees_costs_its_message_alone(
     if beside:
         monkeypatch.setattr(factor_intake, "LARGE_MESSAGE", 0)
     batch, refusals = stage.batch(), stage.driver.link.counters.refusals["unexpected"]
-    monkeypatch.setattr(factor_decoder, "native_copies", broken)
+    monkeypatch.setattr(batch_decoder, "take_in", broken)
     stage.send(stage.answer(batch, [0, 2]))
     stage.driver.until(lambda: stage.failed() == {"a", "c"}, "the refusals")
     assert "was refused: factors of a and 1 more by worker hand: IndexError" in stage.driver.failures[0][1]
@@ -359,16 +361,22 @@ def test_large_batches_are_checked_where_they_are_decoded(
 ) -> None:
     """By what the driver gives for just these jobs, if it gives anything."""
     monkeypatch.setattr(factor_intake, "LARGE_MESSAGE", 0)
-    asked: list[Any] = []
-    verdicts: dict[str, str] = {}
+    check = FactorCheck(
+        {n: (np.frombuffer(b.row_start, np.int32), np.frombuffer(b.columns, np.int32)) for n, b in BEAMS.items()}
+    )
+    residuals: dict[str, float] = {}
 
-    def begin(jobs: Any) -> Any:
-        asked.extend(jobs)
-        return check if known else None
+    def begin(objects: Any, epochs: Any, steps: Any, patterns: Any) -> SentMatrices | None:
+        assert set(epochs) == {1} and set(steps) == {stage.step}
+        bodies = check.bodies(objects, epochs, patterns)
+        assert bodies is not None
+        matrices = [matrix(BEAMS[name], shift(name, stage.step)) for name in objects]
+        return SentMatrices(bodies, matrices, 0, end) if known else None
 
-    def check(factors: Any) -> list[str]:
+    def end(factors: Any, taken: Any) -> None:
         assert threading.current_thread() is not threading.main_thread()
-        return [f"of {name}" for name in factors.objects]
+        residuals.update(zip(factors.objects, taken.found["judged"][:, 4].tolist(), strict=True))
+        factors.reasons = [f"of {name}" for name in factors.objects]
 
     dispatch = stage.driver.link.dispatch
     dispatch.check_with(begin)
@@ -377,11 +385,11 @@ def test_large_batches_are_checked_where_they_are_decoded(
     batch = stage.batch()
     stage.send(stage.answer(batch))
     stage.driver.until(lambda: all_are_back(stage), "the factors")
-    dispatch.check_with(lambda jobs: None)  # other tests use this link, too
-    for each in found:
-        verdicts |= dict(zip(each.objects, each.reasons or [""] * len(each), strict=True))
-    assert verdicts == {name: f"of {name}" if known else "" for name in NAMES}
-    assert sorted(name for name, _ in asked) == sorted(NAMES)
+    dispatch.check_with(lambda *jobs: None)  # other tests use this link, too
+    reasons = {n: why for each in found for n, why in zip(each.objects, each.reasons or [""] * len(each), strict=True)}
+    assert reasons == {name: f"of {name}" if known else "" for name in NAMES}
+    assert set(residuals) == (set(NAMES) if known else set())
+    assert all(0 < residual < 1e-4 for residual in residuals.values()), "each with its own matrix"
     stage.check_factors()
 
 
@@ -392,13 +400,13 @@ def test_large_batches_are_decoded_beside_the_caller(stage: Hand, monkeypatch: p
     free = dispatch.ready()
     batch, go = stage.batch(), threading.Event()
     assert dispatch.ready() == free - len(NAMES)
-    decode, before = stage.driver.link.dispatch.decoder.decode_several, stage.driver.link.counters.refusals["duplicate"]
+    decode, before = factor_intake.decode_several, stage.driver.link.counters.refusals["duplicate"]
 
     def slow(*arguments: Any) -> Any:
         assert go.wait(30)
         return decode(*arguments)
 
-    monkeypatch.setattr(stage.driver.link.dispatch.decoder, "decode_several", slow)
+    monkeypatch.setattr(factor_intake, "decode_several", slow)
     message = stage.answer(batch, [0, 1, 1, 2, 3])
     message.checksums[3] = 7
     stage.send(message)

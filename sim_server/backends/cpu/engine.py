@@ -310,6 +310,13 @@ class CpuEngine(Reports):
             buffer.take(factor.values, factor.step)
             self._mail[body].post(buffer)
 
+    def response_function(self) -> int:
+        """Returns 0: there are no inverses."""
+        return 0
+
+    def planes_by(self, factors: FactorsTogether, responses: Float64) -> None:
+        """Returns None: there are no inverses."""
+
     def prepare_together(self, bodies: Sequence[int], factors: FactorsTogether) -> None:
         """Does nothing: factors are applied as they come."""
 

@@ -29,6 +29,8 @@ from sim_server.backends.gpu.device import DeviceLaunch, Gpu
 from sim_server.backends.gpu.factor_upload import FactorUpload
 from sim_server.backends.gpu.helper import alone
 from sim_server.backends.gpu.host_results import HostResults
+from sim_server.backends.gpu.inverse.device_digits import is_large
+from sim_server.backends.gpu.inverse.digits import planes_by, response_function
 from sim_server.backends.gpu.known_patterns import KnownPatterns
 from sim_server.backends.gpu.loop import CAPACITY, DeviceLoop
 from sim_server.backends.gpu.mailbox import ChangeMailbox, DeviceMailbox
@@ -260,6 +262,17 @@ class GpuEngine(DeviceLoop):
         self._factor_upload.post_many(
             (body, f.pattern, f.values, f.step, 0) for body, f in zip(bodies, factors, strict=True)
         )
+
+    def response_function(self) -> int:
+        """Address of the function that finds the largest response of factors, where digits are chosen by it."""
+        return response_function() if self.solver.planes is None else 0
+
+    def planes_by(self, factors: FactorsTogether, responses: Float64) -> list[int] | None:
+        """Returns how many float16 numbers an entry the inverse of each factor needs, by its largest response (k,);
+        None: not known, as of large factors and of those that are not in float32."""
+        values = factors.values[0]
+        told = self.solver.planes is None and values.dtype == np.float32 and not is_large(values)
+        return planes_by(responses) if told else None
 
     def prepare_together(self, bodies: Sequence[int], factors: FactorsTogether) -> None:
         """Begins to build the inverses of factors, beside steps and caller."""
