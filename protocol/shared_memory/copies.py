@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Copies of many arrays in one call of native code, with the checks of what is received.
+"""Copies of many arrays in one call of native code, with their checksums.
 
 Python's lock is let go once for all of them, not several times for each: with other threads at work, getting it back
 takes longer than to copy a small array.
@@ -16,7 +16,7 @@ import numpy as np
 import xxhash
 from numpy.typing import NDArray
 
-from protocol.shared_memory.located import address
+from protocol.shared_memory.located import address, addresses
 from protocol.validate import ALONE, checksum, copied, helping_threads
 
 SOURCE = Path(__file__).with_name("copies.cpp")
@@ -63,7 +63,7 @@ class Parts(NamedTuple):
 
 
 class Copies:
-    """Copies, or only sums up, arrays of one type, each contiguous.
+    """Copies, or only sums up, arrays, each contiguous.
 
     library: of copies.cpp; None: there is no compiler, and NumPy copies one after another
     """
@@ -72,49 +72,20 @@ class Copies:
         self._library = library if hash_address() is not None else None
         if self._library is not None:
             i, p = c.c_int32, c.c_void_p
-            arguments: list[Any] = [c.c_int64, p, p, p, i, i, p, p, p, p, p, p, i]
+            arguments: list[Any] = [c.c_int64, p, p, p, i, p, p, i]
             self._library.copy_all.restype, self._library.copy_all.argtypes = None, arguments
 
-    def copy(
-        self, sources: Sequence[NDArray[Any]], targets: Sequence[NDArray[Any]], own_sources: bool = False
-    ) -> list[int]:  # fmt: skip
-        """Copies each source to its target, of the same number of bytes. Returns the `checksum` of each target.
-
-        own_sources: other processes may write to the targets, so that of the sources is told; else these may be
-        written to meanwhile
-        """
+    def gather(self, sources: Sequence[NDArray[Any]], target: NDArray[np.uint8]) -> list[int]:
+        """Copies arrays one behind the other to the begin of a target. Returns the `checksum` of each copy. Raises
+        ValueError if there is no room for them."""
+        if not all(each.flags.c_contiguous for each in sources):
+            sources = [np.ascontiguousarray(each) for each in sources]
+        size = np.array([each.nbytes for each in sources], np.int64)
+        parts = Parts(target, np.cumsum(size) - size)
         if self._library is None:
-            pairs = [(s, t.view(s.dtype)) for s, t in zip(sources, targets, strict=True)]
-            return [copied(s, t, s if own_sources else t)[0] for s, t in pairs]
-        size, _ = _sizes(sources)
-        if any(s.nbytes != t.nbytes or not t.flags.c_contiguous for s, t in zip(sources, targets, strict=True)):
-            raise ValueError("a target is not contiguous, or not of the bytes of its source")
-        return self._call(_addresses(sources), _addresses(targets), size, 0, own_sources)[0]
-
-    def take(
-        self, source: Parts, counts: NDArray[np.int64], memory: NDArray[Any], diagonals: Sequence[NDArray[np.int64]]
-    ) -> tuple[list[int], list[bool], list[bool]]:  # fmt: skip
-        """Copies parts of an array, of so many numbers of the type of `memory` each, one behind the other into memory
-        of as many numbers. Returns of each copy its `checksum` and `all_finite`, and whether the numbers on its
-        diagonal are greater than 0. Raises ValueError if a part lies outside of its array.
-
-        source: may be written to meanwhile; what is returned is about the copies
-        diagonals: places in each part of what are to be positive; those of one array are read once
-        """
-        ends, item = np.cumsum(counts), memory.itemsize
-        if item not in (4, 8) or ends[-1] != memory.size or not memory.flags.c_contiguous:
-            raise ValueError(f"{memory.size} numbers of {memory.dtype} for {ends[-1]}")
-        if len(diagonals) != len(counts):
-            raise ValueError(f"{len(diagonals)} diagonals of {len(counts)} arrays")
-        size = counts * item
-        begin = source.addresses(size)
-        if self._library is None:
-            targets = np.split(memory, ends[:-1])
-            looked = [copied(s.view(memory.dtype), t, t) for s, t in zip(source.split(size), targets, strict=True)]
-            own = zip(targets, diagonals, strict=True)
-            return [s for s, _ in looked], [f for _, f in looked], [bool((t[places] > 0).all()) for t, places in own]
-        to = (address(memory) + (ends - counts) * item).astype(np.uintp)
-        return self._call(begin, to, size, item, False, diagonals)
+            pairs = zip([each.reshape(-1).view(np.uint8) for each in sources], parts.split(size), strict=True)
+            return [copied(source, part, part)[0] for source, part in pairs]
+        return self._call(addresses(sources), parts.addresses(size), size, False)
 
     def copy_parts(
         self, source: Parts, target: Parts, size: NDArray[np.int64], own_sources: bool = False
@@ -122,60 +93,30 @@ class Copies:
         """Copies parts of an array to parts of another one, of `size` bytes each (k,); returns the `checksum` of each.
         Raises ValueError if a part lies outside of its array.
 
-        own_sources: as of `copy`
+        own_sources: other processes may write to the targets, so that of the sources is told; else these may be
+        written to meanwhile
         """
         begin, to = source.addresses(size), target.addresses(size)
         if self._library is None:
             pairs = zip(source.split(size), target.split(size), strict=True)
             return [copied(s, t, s if own_sources else t)[0] for s, t in pairs]
-        return self._call(begin, to, size, 0, own_sources)[0]
+        return self._call(begin, to, size, own_sources)
 
     def sum_parts(self, source: Parts, size: NDArray[np.int64]) -> list[int]:
         """Returns the `checksum` of parts of an array, of `size` bytes each (k,). Raises as `copy_parts`."""
         if self._library is None:
             return [checksum(each) for each in source.split(size)]
-        return self._call(source.addresses(size), None, size, 0, True)[0]
+        return self._call(source.addresses(size), None, size, True)
 
     def _call(
-        self, begin: NDArray[np.uintp], targets: NDArray[np.uintp] | None, size: NDArray[np.int64], item: int,
-        own_sources: bool, diagonals: Sequence[NDArray[np.int64]] = (),
-    ) -> tuple[list[int], list[bool], list[bool]]:  # fmt: skip
-        """item: bytes of a number; 0: whether all are finite is not looked at, and there are no diagonals."""
+        self, begin: NDArray[np.uintp], targets: NDArray[np.uintp] | None, size: NDArray[np.int64], own_sources: bool
+    ) -> list[int]:  # fmt: skip
         assert self._library is not None
-        if diagonals and not item:
-            raise ValueError("numbers on diagonals are of no known size")
         count, size = len(begin), np.ascontiguousarray(size, np.int64)
-        places = _Places(diagonals) if diagonals else None
-        sums, finite, positive = np.empty(count, np.uint64), np.ones(count, np.bool_), np.ones(count, np.bool_)
+        sums = np.empty(count, np.uint64)
         threads = 1 + min(helping_threads(), count - 1) if int(size.sum()) > SHARED else 1
         self._library.copy_all(
-            count, begin.ctypes.data, None if targets is None else targets.ctypes.data, size.ctypes.data, item,
-            own_sources, hash_address(), sums.ctypes.data, finite.ctypes.data if item else None,
-            places and places.begin.ctypes.data, places and places.count.ctypes.data, positive.ctypes.data, threads,
+            count, begin.ctypes.data, None if targets is None else targets.ctypes.data, size.ctypes.data, own_sources,
+            hash_address(), sums.ctypes.data, threads,
         )  # fmt: skip
-        return sums.tolist(), finite.tolist(), positive.tolist()
-
-
-def _sizes(arrays: Sequence[NDArray[Any]]) -> tuple[NDArray[np.int64], int]:
-    """Returns the bytes of each array of one type, each contiguous, and of one of their numbers. Raises ValueError."""
-    item = arrays[0].itemsize if arrays else 4
-    if item not in (4, 8) or not all(each.itemsize == item and each.flags.c_contiguous for each in arrays):
-        raise ValueError("arrays are not all contiguous and of numbers of the same 4 or 8 bytes")
-    return np.array([each.nbytes for each in arrays], np.int64), item
-
-
-class _Places:
-    """Places in arrays, as native code reads them. begin: address of the first in each array. count: of each"""
-
-    def __init__(self, each: Sequence[NDArray[np.int64]]):
-        known = {id(places): places for places in each}
-        self._kept = list(known.values())
-        if not all(places.dtype == np.int64 and places.flags.c_contiguous for places in self._kept):
-            raise ValueError("places on a diagonal are not contiguous int64")
-        begin = {key: address(places) for key, places in known.items()}
-        self.begin = np.array([begin[id(places)] for places in each], np.uintp)
-        self.count = np.array([len(places) for places in each], np.int64)
-
-
-def _addresses(arrays: Sequence[NDArray[Any]]) -> NDArray[np.uintp]:
-    return np.array([address(each) for each in arrays], np.uintp)
+        return list(sums.tolist())

@@ -19,6 +19,7 @@ class FactorsTogether(Sequence[Factor]):
 
     values: (nonzeros,) of each
     reasons: why each is not to be used, empty if it is; None: they were not checked
+    planes: float16 numbers an entry that the inverse of each needs (backends/gpu/inverse/digits.py); None: not known
     """
 
     pattern: FactorPattern
@@ -32,6 +33,7 @@ class FactorsTogether(Sequence[Factor]):
     seconds: list[float]
     remedies: list[str]
     reasons: list[str] | None = None
+    planes: list[int] | None = None
 
     def __len__(self) -> int:
         return len(self.objects)
@@ -61,4 +63,5 @@ class FactorsTogether(Sequence[Factor]):
             self.pattern, self.worker, self.method, chosen(self.objects), chosen(self.epochs), chosen(self.steps),
             chosen(self.warps), chosen(self.values), chosen(self.seconds), chosen(self.remedies),
             None if self.reasons is None else chosen(self.reasons),
+            None if self.planes is None else chosen(self.planes),
         )  # fmt: skip

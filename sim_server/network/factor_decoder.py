@@ -1,11 +1,10 @@
 # SPDX-License-Identifier: MIT
 """Checks and decodes what workers send: patterns of L, and factors as bytes or in a slot of shared memory."""
 
-import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cache
-from typing import NamedTuple, TypeVar
+from typing import TypeVar
 from weakref import WeakValueDictionary
 
 import numpy as np
@@ -19,8 +18,6 @@ from protocol.messages_pb2 import FactorPattern as PatternMessage
 from protocol.messages_pb2 import Slot as SlotMessage
 from protocol.method import COMPLETE
 from protocol.refused import Refused
-from protocol.shared_memory.copies import Parts
-from protocol.shared_memory.located import rows
 from protocol.shared_memory.pool import Slot
 from protocol.validate import (
     Sized,
@@ -34,10 +31,8 @@ from protocol.validate import (
     topology_checksum,
 )
 from sim_server.arrays import Float32, Float64
-from sim_server.backends.factors_together import FactorsTogether
 from sim_server.backends.shared_memory import SharedMemory
-from sim_server.network.leases import InFlightJob
-from sim_server.network.native_copies import native_copies
+from sim_server.network.jobs_in_flight import InFlightJob
 from sim_server.scene.size_limits import expected_values
 from sim_server.updates.factor_source import FactorMemory
 
@@ -200,7 +195,7 @@ class FactorDecoder:
         ):
             if value != wanted:
                 raise Refused(f"Factor.{name} is {value!r}; allowed: {wanted!r}, as in the matrix", "malformed")
-        known = self._known(job)
+        known = self.known(job)
         pattern = known.pattern(message.pattern)
         if pattern is None:
             raise Refused(f"Factor.pattern is {message.pattern:016x}, which was not sent before", "pattern")
@@ -218,7 +213,7 @@ class FactorDecoder:
         return self._factor(known, pattern, values, message.checksum, job, message.seconds, message.remedy, seen)
 
     def parse_batch(self, key: object, attachment: Sized | None) -> FactorBatch:
-        """Parses a message with answers to several jobs. Each answer is checked by itself, in `decode_several`."""
+        """Parses a message with answers to several jobs. Each answer is checked by itself (batch_decoder.py)."""
         message = parse(FactorBatch, attachment, CHANNELS["factors"].limit)
         check_header(message, incarnation=self._incarnation)
         check_strings(message, 256)
@@ -233,69 +228,6 @@ class FactorDecoder:
             raise Refused(f"FactorBatch.jobs has {count} numbers, texts {texts}; allowed: none or as many", "shape")
         return message
 
-    def decode_several(self, message: FactorBatch, answers: Sequence[tuple[int, InFlightJob]]) -> "DecodedFactors":
-        """Returns the factors at some places of a message, and why others are refused. From any thread.
-
-        They are copied by one call of native code, one after another into one array.
-        """
-        refused: list[tuple[int, Refused]] = []
-        columns = _AnswerColumns.of(message)
-        found: list[tuple[int, int, InFlightJob, AnnouncedObject, FactorPattern]] = []
-        for k, (place, job) in enumerate(answers):
-            try:
-                found.append((k, place, job, *self._expected(columns, place, job)))
-            except Refused as refusal:
-                refused.append((k, refusal))
-        if not found:
-            return DecodedFactors([], refused)
-        values, sums, finite, positive = self._taken([(job, pattern) for _, _, job, _, pattern in found])
-        good: dict[tuple[int, str], list[int]] = {}  # places in `found` by pattern and method
-        looked = zip(found, values, sums, finite, positive, strict=True)
-        for place, ((k, told, job, known, pattern), own, hashed, is_finite, is_positive) in enumerate(looked):
-            try:
-                if hashed != columns.checksums[told] or not (is_finite and is_positive):
-                    check_values(own, pattern, columns.checksums[told], (hashed, is_finite), is_positive)
-                self._note_size(known, pattern, job)
-                good.setdefault((pattern.id, job.method), []).append(place)
-            except Refused as refusal:
-                refused.append((k, refusal))
-        return DecodedFactors([_together(found, values, columns, places) for places in good.values()], refused)
-
-    def _expected(
-        self, columns: "_AnswerColumns", place: int, job: InFlightJob
-    ) -> tuple[AnnouncedObject, FactorPattern]:  # fmt: skip
-        """Returns the object and the pattern of one of the answers, which has room in its slot."""
-        nonzeros, id = columns.nonzeros[place], columns.patterns[place]
-        if not 0 <= (seconds := columns.seconds[place]) < math.inf:
-            raise Refused(f"FactorBatch.seconds has {seconds}; allowed: finite, 0 or more", "malformed")
-        known = self._known(job)
-        pattern = known.complete.patterns.get(id) or known.patterns.get(id)
-        if pattern is None:
-            raise Refused(f"FactorBatch.patterns has {id:016x}, which was not sent", "pattern")
-        if nonzeros != pattern.nonzeros:
-            raise Refused(f"FactorBatch.nonzeros has {nonzeros}; allowed: {pattern.nonzeros}", "shape")
-        _check_slot(columns.slot, nonzeros, job)
-        return known, pattern
-
-    def _taken(
-        self, found: Sequence[tuple[InFlightJob, FactorPattern]]
-    ) -> tuple[list[Float32 | Float64], list[int], list[bool], list[bool]]:  # fmt: skip
-        """Copies values of factors out of the slot allocated for jobs, which are of one type: they must not change any
-        more once they are checked. Returns them, and of each its checksum, whether all values are finite, and whether
-        the diagonal is positive."""
-        slot, dtype = _slot(found[0][0]), np.dtype(found[0][0].dtype)
-        counts = [pattern.nonzeros for _, pattern in found]
-        total = sum(counts)
-        if total * dtype.itemsize > LARGE:
-            memory = self.memory(1 << (total - 1).bit_length(), dtype)  # of few sizes, so that it is used again
-        else:
-            memory = np.empty(total, dtype)
-        memory, begin = memory[:total], np.array([job.first for job, _ in found], np.int64)
-        source = Parts(slot.part(0, np.uint8, slot.capacity), begin)
-        diagonals = [pattern.diagonal for _, pattern in found]
-        looked = native_copies().take(source, np.array(counts, np.int64), memory, diagonals)
-        return rows(memory, counts), *looked
-
     def _factor(
         self, known: AnnouncedObject, pattern: FactorPattern, values: Float32 | Float64, checksum: int | None,
         job: InFlightJob, seconds: float, remedy: str, seen: tuple[int, bool] | None = None,
@@ -308,10 +240,10 @@ class FactorDecoder:
         seconds: float, remedy: str,
     ) -> Factor:  # fmt: skip
         """Returns the factor of values that were checked."""
-        self._note_size(known, pattern, job)
+        self.note_size(known, pattern, job)
         return Factor(job.object, job.epoch, job.step, job.warp, pattern, values, job.worker, seconds, remedy[:200])
 
-    def _note_size(self, known: AnnouncedObject, pattern: FactorPattern, job: InFlightJob) -> None:
+    def note_size(self, known: AnnouncedObject, pattern: FactorPattern, job: InFlightJob) -> None:
         """Takes note of the pattern of a factor that was checked."""
         if job.object in self._unsized:
             self._unsized.discard(job.object)
@@ -331,7 +263,7 @@ class FactorDecoder:
             known.sizes[method] = {id: size for id, size in sizes.items() if id != pattern}
         known.complete.sizes = {id: size for id, size in known.complete.sizes.items() if id != pattern}
 
-    def _known(self, job: InFlightJob) -> AnnouncedObject:
+    def known(self, job: InFlightJob) -> AnnouncedObject:
         """Returns what is known of the object of a job. From any thread: to be asked once for each answer, as another
         epoch of the object may begin meanwhile."""
         known = self.objects[job.object]
@@ -351,9 +283,9 @@ class FactorDecoder:
     ) -> tuple[Float32 | Float64, tuple[int, bool]]:  # fmt: skip
         """Copies the values out of the slot allocated for the job: they must not change any more once they are checked.
         Returns them, their checksum, and whether all are finite."""
-        size = _check_slot((told.segment, told.offset, told.generation), nonzeros, job)
+        size = check_slot((told.segment, told.offset, told.generation), nonzeros, job)
         values = (self.memory if size > LARGE else np.empty)(nonzeros, np.dtype(job.dtype))
-        return values, copied(_slot(job).part(job.first, job.dtype, nonzeros), values, own=values)
+        return values, copied(slot_of(job).part(job.first, job.dtype, nonzeros), values, own=values)
 
     def _from_device(self, told: DeviceSlotMessage, pattern: FactorPattern, job: InFlightJob) -> Float32 | Float64:
         """Returns a copy of the values in the slot of device memory that was lent for the job, which are checked."""
@@ -378,54 +310,14 @@ class FactorDecoder:
         return self.objects[header.object]
 
 
-class DecodedFactors(NamedTuple):
-    """Of answers in a message: factors with their places among them, and places of others with why they are refused."""
-
-    good: list[tuple[list[int], FactorsTogether]]
-    refused: list[tuple[int, Refused]]
-
-
-def _together(
-    found: Sequence[tuple[int, int, InFlightJob, AnnouncedObject, FactorPattern]],
-    values: Sequence[Float32 | Float64], columns: "_AnswerColumns", places: Sequence[int],
-) -> tuple[list[int], FactorsTogether]:  # fmt: skip
-    """Returns some of the factors that were found, of one pattern and method, and their places among the answers."""
-    chosen = [found[place] for place in places]
-    jobs, told, first = [each[2] for each in chosen], [each[1] for each in chosen], chosen[0]
-    return [each[0] for each in chosen], FactorsTogether(
-        first[4], jobs[0].worker, jobs[0].method, [job.object for job in jobs], [job.epoch for job in jobs],
-        [job.step for job in jobs], [job.warp for job in jobs], [values[place] for place in places],
-        [columns.seconds[k] for k in told], [columns.remedies[k][:200] for k in told],
-    )  # fmt: skip
-
-
-@dataclass(frozen=True)
-class _AnswerColumns:
-    """What a message tells of each of its factors. slot: segment, offset and generation of theirs"""
-
-    seconds: list[float]
-    nonzeros: list[int]
-    patterns: list[int]
-    checksums: list[int]
-    remedies: list[str]
-    slot: tuple[str, int, int]
-
-    @classmethod
-    def of(cls, message: FactorBatch) -> "_AnswerColumns":
-        slot, remedies = message.slot, list(message.remedies) or [""] * len(message.jobs)
-        return cls(
-            list(message.seconds), list(message.nonzeros), list(message.patterns), list(message.checksums), remedies,
-            (slot.segment, slot.offset, slot.generation),
-        )  # fmt: skip
-
-
 def _with_last(entries: dict[int, T], id: int, value: T) -> dict[int, T]:
     """Returns the last entries and this one behind them, MAX_PATTERNS in all. Another thread may read `entries`."""
     others = [each for each in entries.items() if each[0] != id]
     return {**dict(others[1 - MAX_PATTERNS :]), id: value}
 
 
-def _slot(job: InFlightJob) -> Slot:
+def slot_of(job: InFlightJob) -> Slot:
+    """Returns the slot that was lent for the factor of a job."""
     assert job.factor_slot is not None
     return job.factor_slot
 
@@ -435,7 +327,7 @@ def _item_bytes(dtype: str) -> int:
     return np.dtype(dtype).itemsize
 
 
-def _check_slot(given: tuple[str, int, int], nonzeros: int, job: InFlightJob) -> int:
+def check_slot(given: tuple[str, int, int], nonzeros: int, job: InFlightJob) -> int:
     """Returns the bytes of a factor that fits into the slot allocated for its job, and is said to be there."""
     slot = job.factor_slot
     if slot is None:

@@ -16,11 +16,11 @@ from protocol.messages_pb2 import FactorBatch
 from protocol.refused import Refused
 from protocol.shared_memory.pool import Slot, SlotPool
 from sim_server.backends.factors_together import FactorsTogether
+from sim_server.network.batch_decoder import DecodedFactors, decode_several
 from sim_server.network.bookkeeping import Bookkeeping
-from sim_server.network.factor_decoder import DecodedFactors
 from sim_server.network.factor_fetch import AHEAD, FactorFetch
-from sim_server.network.leases import InFlightJob
-from sim_server.updates.factor_source import Check
+from sim_server.network.jobs_in_flight import InFlightJob
+from sim_server.updates.take_in import BeginCheck
 
 T = TypeVar("T")
 
@@ -80,7 +80,7 @@ class FactorIntake:
         self._beside: set[int] = set()  # numbers of their jobs
         self._fetches: set[int] = set()  # of these, the jobs whose factors come in parts
         self.wake: Callable[[], None] = lambda: None  # called in another thread when a factor is decoded
-        self.begin_check: Callable[[Sequence[tuple[str, int]]], Check | None] = lambda jobs: None  # (FactorSource)
+        self.begin_check: BeginCheck = lambda *jobs: None  # (FactorSource.check_with)
 
     def fetched_from(self, worker: str) -> int:
         """Number of jobs that a worker has done, and whose factors are fetched from it part by part, or copied and
@@ -135,11 +135,10 @@ class FactorIntake:
         self._note_answer(message.worker)
         good = [(place, job) for place, job in answers if not self._ends(message, place, job)]
         together = DecodedTogether([job for _, job in good], message.matrix_shared, duration)
-        decode: Callable[[], DecodedFactors] = partial(self._all_decoded, message, good)
         if 4 * sum(message.nonzeros) <= LARGE_MESSAGE:
+            decode = partial(self._all_decoded, message, good, None)
             return self._guarded(together.jobs, partial(self._take_together, together, decode))
-        if (check := self.begin_check([(job.object, job.step) for job in together.jobs])) is not None:
-            decode = partial(_checked, decode, check)
+        decode = partial(self._all_decoded, message, good, self.begin_check)
         self._together.append((together, self._begun(self._messages, decode)))
         self._beside.update(job.number for job in together.jobs)
 
@@ -180,10 +179,12 @@ class FactorIntake:
         except Exception as error:
             raise self._counters.unexpected(error, f"factor of {job.object} by worker {job.worker}") from error
 
-    def _all_decoded(self, message: FactorBatch, answers: Sequence[tuple[int, InFlightJob]]) -> DecodedFactors:
-        """Returns what FactorDecoder.decode_several does, likewise."""
+    def _all_decoded(
+        self, message: FactorBatch, answers: Sequence[tuple[int, InFlightJob]], begin_check: BeginCheck | None
+    ) -> DecodedFactors:  # fmt: skip
+        """Returns what `decode_several` does, likewise."""
         try:
-            return self._book.decoder.decode_several(message, answers)
+            return decode_several(self._book.decoder, message, answers, begin_check)
         except Exception as error:
             first, *others = [job.object for _, job in answers]
             and_more = f" and {len(others)} more" if others else ""
@@ -384,14 +385,6 @@ class FactorIntake:
 def _failure(message: FactorBatch, place: int) -> str:
     """Why a worker made no factor for a job of a batch; empty if it did."""
     return message.failures[place] if message.failures else ""
-
-
-def _checked(decode: Callable[[], DecodedFactors], check: Check) -> DecodedFactors:
-    """Returns factors of a message with what their check tells."""
-    decoded = decode()
-    for _, factors in decoded.good:
-        factors.reasons = check(factors)
-    return decoded
 
 
 def _no_factor() -> Factor:

@@ -6,11 +6,8 @@ With z = P^-1 r the first iteration of conjugate gradients takes (z.r)^2 / (z.Az
 all of it; a factor that takes off less than block Jacobi does is worth less than what costs nothing.
 """
 
-import ctypes as c
 import threading
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from functools import cache
-from itertools import repeat
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -18,20 +15,14 @@ from numpy.typing import NDArray
 
 from protocol.factor import Factor, FactorPattern
 from protocol.shared_memory.located import Located, address, addresses
-from protocol.validate import helping_threads
-from sim_server.arrays import Int32
-from sim_server.backends.compiler import native
-from sim_server.backends.cpu import structs
-from sim_server.backends.cpu.factors import NativePattern
 from sim_server.backends.factors_together import FactorsTogether
+from sim_server.updates.checked_body import FACTOR, WORK, CheckedBody, library, sharing_threads
 from sim_server.updates.patterns import Patterns
 
 Reals = NDArray[np.float64]
 MAX_RESIDUAL = 0.05  # |r - A P^-1 r| / |r| of a factor that is to take the place of A; exact ones in float32 have 1e-3
 WITH_FACTOR, WITH_BLOCK_JACOBI = 1, 2  # parts of a judgement (factor_check.cpp)
 NO_VALUES = np.zeros(1, np.float32)
-WORK = 9  # numbers for each degree of freedom
-FEW = 8  # factors for each thread, at least
 MIN_SHARE = 0.9  # of what block Jacobi takes off, for a factor to be used; not 1, as one vector is not the space
 
 
@@ -48,34 +39,6 @@ class Probe(NamedTuple):
     reduction: float
     block_jacobi: float
     residual: float
-
-
-@cache
-def _library() -> c.CDLL:
-    arguments = [c.c_int32, c.c_int32, *[c.c_void_p] * 9, c.c_int64, c.c_int32]
-    library = native("backends/cpu/native/factor_check.cpp", {"wf_judge_all": (None, arguments)}, stepping=False)
-    structs.LOOP.check_sizes(library)
-    return library
-
-
-FACTOR = np.dtype(structs.Factor)
-
-
-class CheckedBody:
-    """What the check needs of an object: its pattern, that of its factor, and where native code finds them.
-
-    addresses: of row_start, columns, the probe vector and the pattern of the factor
-    """
-
-    def __init__(self, row_start: Int32, columns: Int32, probe: Reals, pattern: FactorPattern):
-        self.row_start, self.columns, self.probe, self.pattern = row_start, columns, probe, pattern
-        self.nodes, self.nonzeros, self._native = len(row_start) - 1, pattern.nonzeros, NativePattern(pattern)
-        arrays = (each.ctypes.data for each in (row_start, columns, probe))
-        self.addresses = (*arrays, c.addressof(self._native.native))
-
-    def fits(self, row_start: Int32, columns: Int32, pattern: FactorPattern) -> bool:
-        """True if the arrays are still those."""
-        return self.row_start is row_start and self.columns is columns and self.pattern is pattern
 
 
 def _within_limits(zr: Any, reduction: Any, block_jacobi: Any, residual: Any) -> tuple[Any, Any, Any]:
@@ -110,7 +73,7 @@ class FactorCheck:
 
     def prepare(self) -> None:
         """Compiles the native check, so that the first factor does not wait for it."""
-        _library()
+        library()
 
     def vector(self, name: str, epoch: int) -> Reals:
         """Returns the probe vector r of an object, for who applies a factor in place of this check."""
@@ -135,14 +98,34 @@ class FactorCheck:
             reasons[fitting[k]] = self._useless(*checked[fitting[k]], Probe(*found[k].tolist()))
         return reasons
 
+    def bodies(
+        self, objects: Sequence[str], epochs: Sequence[int], patterns: Sequence[FactorPattern]
+    ) -> list[CheckedBody] | None:  # fmt: skip
+        """Returns what native code needs to check factors of some objects, each of a pattern (take_in.py); None if one
+        of them is not of the size of its object. From any thread."""
+        at, known, found = self._patterns.at, self._bodies, list[CheckedBody]()
+        with self._lock:
+            for name, epoch, pattern in zip(objects, epochs, patterns, strict=True):
+                row_start, columns = at(name, epoch)
+                body = known.get(name)
+                if body is None or not body.fits(row_start, columns, pattern):
+                    if pattern.size != 3 * (len(row_start) - 1):
+                        return None
+                    body = self._body(name, epoch, pattern)
+                found.append(body)
+        return found
+
     def reject_together(self, factors: FactorsTogether, matrices: Sequence[Reals | None]) -> list[str]:
         """Returns what `reject_reasons` does, of factors that came together. matrices: that they were made from"""
-        sizes = [len(self._patterns.at(*each)[0]) - 1 for each in zip(factors.objects, factors.epochs, strict=True)]
-        if any(3 * nodes != factors.pattern.size for nodes in sizes):
+        bodies = self.bodies(factors.objects, factors.epochs, [factors.pattern] * len(factors))
+        if bodies is None:
             return self.reject_reasons(list(zip(factors, matrices, strict=True)))
-        bodies = self._known(factors.objects, factors.epochs, repeat(factors.pattern))
-        found = _probes(self._judge(Checked(bodies, factors.values, matrices), WITH_FACTOR | WITH_BLOCK_JACOBI))
-        reasons = [""] * len(factors)
+        judged = self._judge(Checked(bodies, factors.values, matrices), WITH_FACTOR | WITH_BLOCK_JACOBI)
+        return self.reasons(factors, matrices, judged)
+
+    def reasons(self, factors: FactorsTogether, matrices: Sequence[Reals | None], judged: Reals) -> list[str]:
+        """Returns why each of some factors is not to be used; empty if it is. judged: of each, as of wf_judge_all"""
+        found, reasons = _probes(judged), [""] * len(factors)
         for k in np.flatnonzero(self._may_be_useless(found)).tolist():
             reasons[k] = self._useless(factors[k], matrices[k], Probe(*found[k].tolist()))
         return reasons
@@ -221,7 +204,7 @@ class FactorCheck:
         factors, nodes = np.zeros(count, FACTOR), np.array([body.nodes for body in bodies], np.int32)
         factors["pattern"], factors["values"] = pattern, addresses(values)
         factors["bytes"] = [each.itemsize for each in values]
-        threads, room = 1 + min(helping_threads(), count // FEW), WORK * 3 * int(nodes.max())
+        threads, room = sharing_threads(count), WORK * 3 * int(nodes.max())
         if threads * room > len(self._work):
             self._work = np.empty(threads * room)
         there = [k for k, matrix in enumerate(matrices) if matrix is not None]
@@ -229,7 +212,7 @@ class FactorCheck:
         known[there] = addresses([matrix for matrix in matrices if matrix is not None])
         z, out = np.full(count, 0 if applied is None else address(applied), np.uintp), np.zeros((count, 5))
         arrays = factors, nodes, row_start, columns, known, r, z, self._work, out
-        _library().wf_judge_all(count, parts, *map(address, arrays), room, threads)
+        library().wf_judge_all(count, parts, *map(address, arrays), room, threads)
         return out
 
     def _known(

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -16,13 +17,12 @@ from protocol.method import Method
 from sim_server.arrays import Float64, Int32
 from sim_server.backends.factors_together import FactorsTogether
 from sim_server.updates.patterns import Patterns
+from sim_server.updates.take_in import BeginCheck
 
 if TYPE_CHECKING:
     from precond_worker.factorization.registry import Factorization
 
 EXACT = Method()
-Check = Callable[[FactorsTogether], list[str]]
-"""Returns why each of some factors is not to be used; empty if it is. From any thread."""
 FactorMemory = Callable[[int, np.dtype[Any]], NDArray[Any]]
 
 
@@ -59,6 +59,10 @@ class FactorSource(Protocol):
     is one worker in this process; a pool of workers replaces them.
     """
 
+    def round(self) -> AbstractContextManager[None]:
+        """Takes in what has arrived at the begin of a round of calls, and nothing more within it."""
+        return nullcontext()
+
     @abstractmethod
     def ready(self) -> int:
         """Number of jobs that idle workers could take now."""
@@ -91,11 +95,8 @@ class FactorSource(Protocol):
         """Has large factors that arrive put into arrays that `memory` makes, of their number of values and type."""
         return
 
-    def check_with(self, begin: Callable[[Sequence[tuple[str, int]]], Check | None]) -> None:
-        """Has factors that are taken in beside the caller checked there.
-
-        begin: for the answers to jobs (object, step); returns what checks their factors, or None. From any thread
-        """
+    def check_with(self, begin: BeginCheck) -> None:
+        """Has factors that are taken in beside the caller checked there."""
         return
 
     def worker_count(self) -> int:

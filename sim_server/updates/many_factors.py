@@ -13,10 +13,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from protocol.factor import FactorPattern
 from sim_server.arrays import Float64
 from sim_server.backends.factors_together import FactorsTogether
 from sim_server.updates.body_state import BodyUpdateState, MadeFactors, on_checks, on_factors
-from sim_server.updates.factor_source import Check
+from sim_server.updates.take_in import SentMatrices, TakenIn
 from sim_server.updates.update_table import NONE
 
 if TYPE_CHECKING:
@@ -31,31 +32,39 @@ class ManyFactors:
     def __init__(self, driver: Driver):
         self._driver = driver
 
-    def begin_check(self, jobs: Sequence[tuple[str, int]]) -> Check | None:
-        """Returns what checks the factors of jobs (object, step) that have come, in another thread, with the matrices
-        that were sent; None: that must wait until they are adopted. From any thread; of a job that is over meanwhile it
-        may read another matrix, and what it tells counts for nothing (`_still_sent`)."""
-        matrices: dict[str, Float64] = {}
-        for name, step in jobs:
+    def begin_check(
+        self, objects: Sequence[str], epochs: Sequence[int], steps: Sequence[int], patterns: Sequence[FactorPattern]
+    ) -> SentMatrices | None:  # fmt: skip
+        """Returns what factors that arrive are checked with: the matrices that were sent; None: that must wait until
+        they are adopted. From any thread; of a job that is over meanwhile it may be another matrix, and what is found
+        counts for nothing (`_still_sent`)."""
+        matrices: list[Float64] = []
+        for name, step in zip(objects, steps, strict=True):
             state = self._driver.by_name.get(name)
             sent = None if state is None else state.job.matrix
             if sent is None or sent[0] != step or sent[1].ndim != 3:
                 return None
-            matrices[name] = sent[1]
-        return partial(self._checked, matrices)
+            matrices.append(sent[1])
+        bodies = self._driver.check.bodies(objects, epochs, patterns)
+        if bodies is None:
+            return None
+        by_name = dict(zip(objects, matrices, strict=True))
+        return SentMatrices(bodies, matrices, self._driver.engine.response_function(), partial(self._note, by_name))
 
     def _still_sent(self, factors: FactorsTogether, rows: Sequence[int]) -> list[bool]:
         """Returns of which factors the matrix is still there that was sent. rows: their bodies"""
         sent = [self._driver.bodies[row].job.matrix for row in rows]
         return [own is not None and own[0] == step for own, step in zip(sent, factors.steps, strict=True)]
 
-    def _checked(self, matrices: Mapping[str, Float64], factors: FactorsTogether) -> list[str]:
-        return self._driver.reasons(len(factors), self._judged, matrices, factors)
+    def _note(self, matrices: Mapping[str, Float64], factors: FactorsTogether, taken: TakenIn) -> None:
+        """Takes note of what was found about factors that arrived, and has those that are good made ready for use."""
+        factors.reasons = self._driver.reasons(len(factors), self._judged, matrices, factors, taken)
 
-    def _judged(self, matrices: Mapping[str, Float64], factors: FactorsTogether) -> list[str]:
-        """Checks factors, and has those that are good made ready for use."""
+    def _judged(self, matrices: Mapping[str, Float64], factors: FactorsTogether, taken: TakenIn) -> list[str]:
         driver = self._driver
-        reasons = driver.check.reject_together(factors, [matrices[name] for name in factors.objects])
+        sent = [matrices[name] for name in factors.objects]
+        reasons = driver.check.reasons(factors, sent, taken.found["judged"])
+        factors.planes = driver.engine.planes_by(factors, taken.found["response"])
         good = factors if not any(reasons) else factors.of([k for k, why in enumerate(reasons) if not why])
         if len(good) >= MANY:
             driver.engine.prepare_together([driver.by_name[name].body.index for name in good.objects], good)

@@ -2,11 +2,13 @@
 """Whose matrix is factorized next: pure functions of counters, no clock, no I/O.
 
 excess       the rule of Courtecuisse et al. 2010, section 4: each object sums up its CG iterations above a floor, and
-             the object with the largest sum goes next; a matrix that is sent sets its object's sum back to zero. Two
+             the object with the largest sum goes next; a matrix that is sent sets its object's sum back to zero. Three
              things are ours: the sum begins anew when the factor is taken up, since what was summed while it was made
-             is what it is for; and sums are compared as they will be a few steps from now if the excess of the last
-             solve goes on, so that an object that has just been seized need not add up its sum first. Steps that do
-             not iterate add the estimate of their error over the bound instead (body_state.excess)
+             is what it is for; sums are compared as they will be a few steps from now if the excess of the last
+             solve goes on, so that an object that has just been seized need not add up its sum first; and they are
+             compared times the square root of the steps since the last matrix: else one that always iterates three
+             times as much, whatever its factor, would have three times as many. Steps that do not iterate add the
+             estimate of their error over the bound instead (body_state.excess)
 round_robin  the object whose matrix was sent longest ago
 
 Whatever the rule, an object whose last matrix is `overdue` goes first, so none starves.

@@ -192,8 +192,9 @@ int64_t wf_pick(const Requests* q, int64_t count, int64_t places, int64_t min_in
         const int64_t waited = q->waited[k];
         const bool unsent = waited < 0, late = waited >= overdue;
         if (q->in_flight[k] || !(unsent || waited >= min_interval << std::min<int64_t>(q->failures[k], MAX_DOUBLINGS))) continue;
-        // The sum as it will be OUTLOOK steps from now if the excess of the last solve goes on
-        const double need = rule == BY_EXCESS ? q->excess[k] + OUTLOOK * q->latest[k] : waited;
+        // The sum as it will be OUTLOOK steps from now if the excess of the last solve goes on, and what was waited for it
+        const double sum = q->excess[k] + OUTLOOK * q->latest[k];
+        const double need = rule == BY_EXCESS ? sum * std::sqrt(double(std::max<int64_t>(waited, 1))) : waited;
         ready.push_back({unsent ? 0 : late ? 1 : 2, unsent ? q->excess[k] : late ? waited : need, unsent ? 0 : waited, k});
     }
     const int64_t n = std::min<int64_t>(std::max<int64_t>(places, 0), ready.size());

@@ -15,7 +15,7 @@ from sim_server.backends import ring_buffers
 from sim_server.backends.cpu.structs import REACTION, REACTION_KINDS
 from sim_server.backends.gpu import loop as loop_module
 from sim_server.backends.gpu.loop import BATCH, CAPACITY, FRAMES
-from sim_server.backends.gpu.mailbox import ChangeMailbox, post_all
+from sim_server.backends.gpu.mailbox import ChangeMailbox
 from sim_server.backends.gpu.structs import NEWTON_RESULT, PAIR_SUM, STAGE_RESULT
 from sim_server.backends.measured import Measured
 from sim_server.backends.rosenbrock import FORMS
@@ -301,32 +301,61 @@ def test_what_was_not_taken_can_be_withdrawn():
     assert scene.loop.records()["factor_step"].tolist() == [0, 10]
 
 
+class MailEvent:
+    """An event of a build as CuPy has it."""
+
+    def __init__(self, scene: FakeScene, done: bool):
+        self.ptr = scene.device.event()
+        scene.device.begin(self.ptr)
+        if done:
+            scene.device.record(self.ptr)
+
+
 def test_mail_that_is_posted_together_is_taken_as_if_it_were_posted_alone():
     """Each waits for its own event, what was not taken is replaced, and its memory lives as long as it is used."""
     scene = FakeScene(bodies=3)
-    boxes, event = scene.loop.mailboxes[3:], scene.device.event()
+    boxes, all_of_them = scene.loop.mailboxes_of_bodies(3), np.arange(3)
+    late, done = MailEvent(scene, done=False), MailEvent(scene, done=True)
 
-    def post(values: list[int], events: list[int]) -> list[Any]:
-        rows = np.array(values, np.int64)[:, None].view(np.uint8)
-        return post_all(boxes[:3], rows, [None] * 3, events)
+    def post(bodies: list[int], values: list[int], event: MailEvent) -> None:
+        boxes.post(np.array(bodies), np.array(values, np.int64)[:, None].view(np.uint8), event)
 
-    scene.device.begin(event)
-    done = scene.device.event()
-    scene.device.record(done)
-    first = post([5, 6, 7], [done] * 3)
-    second = post([8, 9, 10], [done, event, done])
+    post([0, 1, 2], [5, 6, 7], done)
+    post([2, 0], [10, 8], done)
+    post([1], [9], late)
     gc.collect()
     scene.loop.run(2)
-    assert [box.taken for box in boxes[:3]] == [True, False, True]
-    assert [mail.taken for mail in first] == [-1] * 3 and [mail.taken for mail in second] == [0, -1, 0]
-    scene.device.record(event)
+    assert boxes.taken(all_of_them).tolist() == [True, False, True]
+    scene.device.record(late.ptr)
     scene.loop.run(1)
-    assert [box.taken for box in boxes[:3]] == [True] * 3 and second[1].taken == 2
+    assert boxes.taken(all_of_them).all() and boxes.after(all_of_them).tolist() == [0, 2, 0]
     assert scene.loop.records()["factor_step"].reshape(3, 3).tolist() == [[8, 0, 10], [8, 0, 10], [8, 9, 10]]
-    post([11, 12, 13], [done] * 3)
-    boxes[0].post(number(14))
+
+
+def test_of_many_mailboxes_what_was_not_taken_can_be_withdrawn():
+    scene = FakeScene(bodies=2)
+    boxes, late = scene.loop.mailboxes_of_bodies(2), MailEvent(scene, done=False)
+    boxes.post(np.arange(2), np.array([[5], [6]], np.int64).view(np.uint8), late)
+    scene.loop.run(1)  # the loop holds them, but does not use them
+    assert boxes.withdraw(1) and not boxes.withdraw(1)
+    scene.device.record(late.ptr)
     scene.loop.run(1)
-    assert scene.factor.tolist() == [14, 12, 13]
+    assert not boxes.withdraw(0) and scene.factor.tolist() == [5, 0]
+
+
+def test_what_mail_of_bodies_points_to_lives_until_the_device_is_done_with_it():
+    """A step under way may use what was posted before the last mail."""
+    scene = FakeScene(bodies=2)
+    boxes, kept = scene.loop.mailboxes_of_bodies(2), list[weakref.ref]()
+    for value in range(4):
+        what = Held()
+        boxes.post(np.arange(2), np.full((2, 1), value).view(np.uint8), keep=what)
+        kept.append(weakref.ref(what))
+        del what
+        gc.collect()
+        assert [each() is not None for each in kept[-2:]] == [True] * len(kept[-2:])
+        scene.loop.run(1)
+    assert kept[0]() is None and scene.factor.tolist() == [3, 3]
 
 
 class Held:
@@ -710,20 +739,20 @@ def test_a_matrix_in_the_memory_of_the_loop_is_not_copied_once_more():
     assert all(scene.loop.copy_memory(k) is memory and memory.shape == (2, 3, 3) for k, memory in enumerate(own))
     scene.loop.request_matrix(0, own[0])
     scene.loop.request_matrix(2, own[2])
-    assert scene.loop.matrix_steps([0, 1, 2]).tolist() == [-1, -1, -1]
+    assert scene.loop.matrix_steps(np.array([0, 1, 2])).tolist() == [-1, -1, -1]
     scene.loop.run(40)
-    assert scene.loop.matrix_steps([2, 1, 0]).tolist() == [20, -1, 20]
+    assert scene.loop.matrix_steps(np.array([2, 1, 0])).tolist() == [20, -1, 20]
     assert (own[0] == 20).all() and (own[2] == 20).all() and not own[1].any()
     next_one = scene.loop.copy_memory(0)
     scene.loop.request_matrix(0, next_one)
     scene.loop.request_matrix(1, own[1])
     scene.loop.run(40)
-    assert scene.loop.matrix_steps([0, 1, 2]).tolist() == [60, 60, 20]
+    assert scene.loop.matrix_steps(np.array([0, 1, 2])).tolist() == [60, 60, 20]
     assert (own[0] == 20).all() and (next_one == 60).all() and (own[1] == 60).all() and (own[2] == 20).all()
     scene.loop.request_matrix(1, target)
     scene.loop.request_matrix(0, scene.loop.copy_memory(0))
     scene.loop.run(40)
-    assert scene.loop.matrix_steps([0, 1, 2]).tolist() == [100, 100, 20]
+    assert scene.loop.matrix_steps(np.array([0, 1, 2])).tolist() == [100, 100, 20]
     assert (own[0] == 100).all() and (next_one == 60).all() and (own[1] == 60).all() and (target == 100).all()
 
 
@@ -731,16 +760,16 @@ def test_matrices_of_several_bodies_are_requested_at_once_as_one_by_one():
     scene = FakeScene(bodies=3)
     scene.loop.run(20)
     first = [scene.loop.copy_memory(k) for k in range(3)]
-    asked = scene.loop.request_matrices([2, 0])
+    asked = scene.loop.request_matrices(np.array([2, 0]))
     assert asked[0] is first[2] and asked[1] is first[0]
-    assert scene.loop.matrix_steps([0, 1, 2]).tolist() == [-1, -1, -1]
+    assert scene.loop.matrix_steps(np.array([0, 1, 2])).tolist() == [-1, -1, -1]
     scene.loop.run(40)
-    assert scene.loop.matrix_steps([0, 1, 2]).tolist() == [20, -1, 20]
+    assert scene.loop.matrix_steps(np.array([0, 1, 2])).tolist() == [20, -1, 20]
     assert (first[0] == 20).all() and (first[2] == 20).all() and not first[1].any()
-    again = scene.loop.request_matrices([0, 1])
+    again = scene.loop.request_matrices(np.array([0, 1]))
     assert again[0] is not first[0] and again[1] is first[1]
     scene.loop.run(40)
-    assert scene.loop.matrix_steps([0, 1, 2]).tolist() == [60, 60, 20]
+    assert scene.loop.matrix_steps(np.array([0, 1, 2])).tolist() == [60, 60, 20]
     assert (first[0] == 20).all() and (again[0] == 60).all() and (again[1] == 60).all()
     scene.loop.request_matrix(0, third := scene.loop.copy_memory(0))
     scene.loop.run(40)
@@ -752,7 +781,7 @@ def test_matrices_of_another_type_or_large_ones_have_no_memory_of_the_loop(monke
     if real == "f8":
         monkeypatch.setattr(loop_module, "DOUBLED", 100)
     scene, target = FakeScene(bodies=2, real=real), np.zeros((2, 3, 3))
-    assert scene.loop.copy_memory(1) is None and scene.loop.request_matrices([0, 1]) is None
+    assert scene.loop.copy_memory(1) is None and scene.loop.request_matrices(np.array([0, 1])) is None
     for step in (0, 40):
         scene.loop.request_matrix(1, target)
         scene.loop.run(40)
@@ -795,11 +824,11 @@ def test_matrices_that_are_asked_together_are_copied_in_one_launch_and_come_in_o
     scene, size = FakeScene(bodies=6), 2 * 72
     scene.loop.run(20)
     graphs, found = launched(scene), transfers(scene)
-    first = scene.loop.request_matrices([4, 2, 3])
+    first = scene.loop.request_matrices(np.array([4, 2, 3]))
     scene.loop.run(20)
     assert graphs.count(COPY_GRAPHS[2]) == 1 and found == [(6 * size + 2 * size, 3 * size)]
     found.clear()
-    second = scene.loop.request_matrices([0, 1, 2, 3, 5])
+    second = scene.loop.request_matrices(np.array([0, 1, 2, 3, 5]))
     scene.loop.run(20)
     assert found == [(2 * size, 2 * size), (6 * size, 2 * size), (11 * size, size)]
     assert graphs.count(COPY_GRAPHS[2]) == 2

@@ -4,7 +4,8 @@
 import math
 import os
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -18,13 +19,16 @@ from protocol.messages_pb2 import FactorBatch, MatrixBatch
 from protocol.shared_memory.limits import obstacle
 from protocol.shared_memory.view import SlotMap
 from protocol.validate import checksum
-from sim_server.network import factor_decoder, factor_intake, job_sender, worker_choice
+from sim_server.network import batch_decoder, factor_intake, job_sender, worker_choice
 from sim_server.network.batch_message import MOST_TOGETHER
 from sim_server.network.job_sender import JobSender
 from sim_server.network.link import ServerLink
 from sim_server.network.send_queue import SendQueue
 from sim_server.network.worker_timing import WorkerTiming
+from sim_server.updates.factor_check import FactorCheck
 from sim_server.updates.factor_source import Job
+from sim_server.updates.jobs_together import JobsTogether
+from sim_server.updates.take_in import SentMatrices
 from tests.ports import free_endpoint
 
 pytestmark = [
@@ -67,13 +71,15 @@ class Hand:
             self.hand.answer(answer, values)
             self.driver.until(lambda name=name: any(f.object == name for f in self.driver.factors), "a first factor")
 
-    def batch(self, names: tuple[str, ...] = NAMES) -> MatrixBatch:
+    def batch(
+        self, names: tuple[str, ...] = NAMES, form: Callable[[list[Job]], Sequence[Job]] = list
+    ) -> MatrixBatch:  # fmt: skip
         """Has the server send one; its matrices are what was given."""
         self.step += 1
         self.driver.factors.clear()
         self.driver.failures.clear()
         self.driver.until(lambda: self.driver.link.dispatch.ready() >= len(names), "room")
-        assert self.driver.link.dispatch.submit_many(jobs(self.step, names)) == [True] * len(names)
+        assert self.driver.link.dispatch.submit_many(form(jobs(self.step, names))) == [True] * len(names)
         sample = self.driver.until(self.received.try_recv, "the batch")
         batch = MatrixBatch.FromString(bytes(sample.attachment))
         values = self.slots.array(batch.matrix_slot, np.float64, 9 * sum(batch.blocks))
@@ -160,31 +166,45 @@ def test_answers_may_come_in_parts_and_in_any_order(stage: Hand) -> None:
     assert stage.driver.link.slots_lent == 0
 
 
-def test_jobs_that_are_looked_up_at_once_travel_as_those_looked_up_one_by_one(
-    stage: Hand, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    found, real, used, senders = [], JobSender.alike, [], set()
+def test_jobs_by_columns_travel_as_a_list_of_them(stage: Hand, monkeypatch: pytest.MonkeyPatch) -> None:
+    """All at once, as long as one worker has room and all may share batches; else one by one."""
+    one_by_one, real, told = list[int](), JobSender.submit_sorted, []
 
-    def alike(sender: JobSender, given: Any) -> Any:
-        senders.add(sender)
-        used.append(real(sender, given))
-        return used[-1] if found else None
+    def submit_sorted(sender: JobSender, jobs: Sequence[Job], *others: Any) -> list[bool]:
+        one_by_one.append(len(jobs))
+        return real(sender, jobs, *others)
 
+    monkeypatch.setattr(JobSender, "submit_sorted", submit_sorted)
+    dispatch = stage.driver.link.dispatch
     for name in NAMES:
-        stage.driver.link.dispatch.factor_helped("hand", name)  # what failed in other tests is forgotten
-    monkeypatch.setattr(JobSender, "alike", alike)
-    for _ in range(2):
-        batch = stage.batch()
-        found.append({name: list(getattr(batch, name)) for name in ("objects", "epochs", "warps", "blocks", "rooms")})
+        dispatch.factor_helped("hand", name)  # what failed in other tests is forgotten
+    for form in (list, JobsTogether.of):
+        batch = stage.batch(form=form)
+        told.append({name: list(getattr(batch, name)) for name in ("objects", "epochs", "warps", "blocks", "rooms")})
         stage.send(stage.answer(batch))
         stage.driver.until(lambda: stage.made() == set(NAMES), "their factors")
-    assert found[0] == found[1] and None not in used and len(used) == 2
-    (sender,), flying = senders, stage.batch(("a", "b"))
-    assert real(sender, jobs(950, ("b", "c"))) is None, "one has a job in flight"
-    assert real(sender, [*jobs(950, ("c",)), *jobs(951, ("c",))]) is None, "twice the same"
-    assert real(sender, [*jobs(950, ("c",)), *jobs(950, ("d",), dtype="float64")]) is None
+    assert told[0] == told[1] and one_by_one == [4]
+    flying = stage.batch(("a", "b"), form=JobsTogether.of)
+    assert one_by_one == [4] and dispatch.submit_many(JobsTogether.of(jobs(950, ("b",) * 2))) == [False] * 2
     stage.send(stage.answer(flying))
     stage.driver.until(lambda: stage.made() == {"a", "b"}, "their factors")
+    with pytest.raises(ValueError, match="not announced"):
+        dispatch.submit_many(JobsTogether.of([replace(job, epoch=2) for job in jobs(950)]))
+    with pytest.raises(ValueError, match="values"):
+        dispatch.submit_many(JobsTogether.of([replace(job, values=job.values[1:]) for job in jobs(950)]))
+    assert one_by_one == [4, 2, 4, 4] and not dispatch.leases.jobs
+
+
+def test_jobs_for_which_there_is_no_room_are_not_taken(stage: Hand) -> None:
+    dispatch = stage.driver.link.dispatch
+    stage.hello(most_jobs=3)
+    stage.driver.until(lambda: dispatch.ready() == 3, "the hello")
+    assert dispatch.submit_many(JobsTogether.of(jobs(960))) == [True] * 3 + [False]
+    stage.step, sample = 960, stage.driver.until(stage.received.try_recv, "the batch")
+    stage.send(stage.answer(MatrixBatch.FromString(bytes(sample.attachment))))
+    stage.driver.until(lambda: stage.made() >= {"a", "b", "c"} and not dispatch.leases.jobs, "their factors")
+    stage.hello()
+    stage.driver.until(lambda: dispatch.ready() == 64, "the hello")
 
 
 def test_an_object_alone_goes_as_ever(stage: Hand) -> None:
@@ -272,7 +292,7 @@ def test_an_error_that_no_check_foresees_costs_its_message_alone(
     if beside:
         monkeypatch.setattr(factor_intake, "LARGE_MESSAGE", 0)
     batch, refusals = stage.batch(), stage.driver.link.counters.refusals["unexpected"]
-    monkeypatch.setattr(factor_decoder, "native_copies", broken)
+    monkeypatch.setattr(batch_decoder, "take_in", broken)
     stage.send(stage.answer(batch, [0, 2]))
     stage.driver.until(lambda: stage.failed() == {"a", "c"}, "the refusals")
     assert "was refused: factors of a and 1 more by worker hand: IndexError" in stage.driver.failures[0][1]
@@ -359,16 +379,22 @@ def test_large_batches_are_checked_where_they_are_decoded(
 ) -> None:
     """By what the driver gives for just these jobs, if it gives anything."""
     monkeypatch.setattr(factor_intake, "LARGE_MESSAGE", 0)
-    asked: list[Any] = []
-    verdicts: dict[str, str] = {}
+    check = FactorCheck(
+        {n: (np.frombuffer(b.row_start, np.int32), np.frombuffer(b.columns, np.int32)) for n, b in BEAMS.items()}
+    )
+    residuals: dict[str, float] = {}
 
-    def begin(jobs: Any) -> Any:
-        asked.extend(jobs)
-        return check if known else None
+    def begin(objects: Any, epochs: Any, steps: Any, patterns: Any) -> SentMatrices | None:
+        assert set(epochs) == {1} and set(steps) == {stage.step}
+        bodies = check.bodies(objects, epochs, patterns)
+        assert bodies is not None
+        matrices = [matrix(BEAMS[name], shift(name, stage.step)) for name in objects]
+        return SentMatrices(bodies, matrices, 0, end) if known else None
 
-    def check(factors: Any) -> list[str]:
+    def end(factors: Any, taken: Any) -> None:
         assert threading.current_thread() is not threading.main_thread()
-        return [f"of {name}" for name in factors.objects]
+        residuals.update(zip(factors.objects, taken.found["judged"][:, 4].tolist(), strict=True))
+        factors.reasons = [f"of {name}" for name in factors.objects]
 
     dispatch = stage.driver.link.dispatch
     dispatch.check_with(begin)
@@ -377,11 +403,11 @@ def test_large_batches_are_checked_where_they_are_decoded(
     batch = stage.batch()
     stage.send(stage.answer(batch))
     stage.driver.until(lambda: all_are_back(stage), "the factors")
-    dispatch.check_with(lambda jobs: None)  # other tests use this link, too
-    for each in found:
-        verdicts |= dict(zip(each.objects, each.reasons or [""] * len(each), strict=True))
-    assert verdicts == {name: f"of {name}" if known else "" for name in NAMES}
-    assert sorted(name for name, _ in asked) == sorted(NAMES)
+    dispatch.check_with(lambda *jobs: None)  # other tests use this link, too
+    reasons = {n: why for each in found for n, why in zip(each.objects, each.reasons or [""] * len(each), strict=True)}
+    assert reasons == {name: f"of {name}" if known else "" for name in NAMES}
+    assert set(residuals) == (set(NAMES) if known else set())
+    assert all(0 < residual < 1e-4 for residual in residuals.values()), "each with its own matrix"
     stage.check_factors()
 
 
@@ -392,13 +418,13 @@ def test_large_batches_are_decoded_beside_the_caller(stage: Hand, monkeypatch: p
     free = dispatch.ready()
     batch, go = stage.batch(), threading.Event()
     assert dispatch.ready() == free - len(NAMES)
-    decode, before = stage.driver.link.dispatch.decoder.decode_several, stage.driver.link.counters.refusals["duplicate"]
+    decode, before = factor_intake.decode_several, stage.driver.link.counters.refusals["duplicate"]
 
     def slow(*arguments: Any) -> Any:
         assert go.wait(30)
         return decode(*arguments)
 
-    monkeypatch.setattr(stage.driver.link.dispatch.decoder, "decode_several", slow)
+    monkeypatch.setattr(factor_intake, "decode_several", slow)
     message = stage.answer(batch, [0, 1, 1, 2, 3])
     message.checksums[3] = 7
     stage.send(message)
@@ -453,8 +479,7 @@ def test_slots_are_not_lent_again_before_they_are_sent(stage: Hand, monkeypatch:
     stage.driver.until(lambda: dispatch.ready() >= len(NAMES) and not stage.driver.link.slots_lent, "room")
     monkeypatch.setattr(SendQueue, "post", lambda queue, send, name=None: held.append(send) or True)
     assert dispatch.submit_many(jobs(950)) == [True] * len(NAMES)
-    for job in dispatch.leases.jobs:
-        dispatch.leases.cancel(job)
+    dispatch.leases.cancel(dispatch.leases.jobs)
     stage.driver.turn()
     assert len(held) == 1 and stage.driver.link.slots_lent == 2
     held[0]()

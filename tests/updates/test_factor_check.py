@@ -13,7 +13,7 @@ from precond_worker.factorization.registry import make_factorization
 from protocol.factor import Factor
 from protocol.method import Method
 from sim_server.simulation import Simulation
-from sim_server.updates import factor_check
+from sim_server.updates import checked_body
 from sim_server.updates.driver import Driver
 from sim_server.updates.factor_check import FactorCheck
 from sim_server.updates.factor_source import Inline, Job
@@ -127,7 +127,7 @@ def several(sim: Simulation, matrix: NDArray) -> list[tuple[Factor, NDArray | No
 @pytest.mark.parametrize(("alone", "helping"), [(False, 0), (False, 3), (True, 3)])
 def test_each_of_many_is_judged_as_if_it_came_alone(alone, helping, monkeypatch):
     """To the bit, whatever the number of threads that share them."""
-    monkeypatch.setattr(factor_check, "helping_threads", lambda: helping)
+    monkeypatch.setattr(checked_body, "helping_threads", lambda: helping)
     sim = bent()
     check, matrix = check_of(sim, alone)
     many = several(sim, matrix)

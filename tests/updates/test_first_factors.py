@@ -6,7 +6,6 @@ import pytest
 
 from protocol.factor import Factor
 from sim_server.backends.base import Due
-from sim_server.backends.factors_together import FactorsTogether
 from sim_server.simulation import Simulation
 from sim_server.updates.driver import Driver
 from sim_server.updates.factor_source import Inline, Job
@@ -139,23 +138,19 @@ def test_a_check_that_lasts_longer_than_the_time_out_is_of_the_first_matrix(monk
     workers, begun = Workers(sim), []
     monkeypatch.setattr(workers, "check_with", begun.append, raising=False)
     driver, workers.held = Driver(sim, workers), True
-    time, checks, seen = Time(), [], []
+    time, checks = Time(), []
 
     def sleep(seconds: float) -> None:
         if workers.jobs and not checks:
-            checks.append(begun[0]([("b", 0)]))
+            (factor,) = workers._done
+            checks.append(begun[0](["b"], [1], [0], [factor.pattern]))
         time.sleep(seconds)
 
     assert FirstFactors(driver, time.clock, sleep).run()
     (job,) = workers.jobs
     before = job.values.copy()
     driver.advance(3)
-    monkeypatch.setattr(driver.check, "reject_together", lambda factors, matrices: seen.extend(matrices) or [""])
-    (factor,) = workers._done
-    one = FactorsTogether(
-        factor.pattern, "w", "cholesky", ["b"], [1], [0], [True], [factor.values], [1e-3], [""]
-    )  # fmt: skip
-    assert checks[0](one) == [""] and np.array_equal(seen[0], before)
+    assert np.array_equal(checks[0].matrices, [before])
     assert not np.array_equal(driver.engine.factor_matrix(1), before), "or it shows nothing"
 
 

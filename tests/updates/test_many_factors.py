@@ -11,12 +11,14 @@ import pytest
 
 from protocol.factor import Factor
 from protocol.method import Method
+from protocol.shared_memory.copies import Parts
 from sim_server.backends.factors_together import FactorsTogether
 from sim_server.simulation import Simulation
 from sim_server.updates.driver import Driver
 from sim_server.updates.factor_check import FactorCheck
 from sim_server.updates.factor_source import FactorSource, Job
 from sim_server.updates.many_factors import MANY
+from sim_server.updates.take_in import SentMatrices, take_in
 from sim_server.updates.update_table import NONE
 from tests.scenes import bar, simulation
 
@@ -31,7 +33,7 @@ class Messages(FactorSource):
         self.together: list[FactorsTogether] = []
         self.over: set[str] = set()  # objects that were split since
         self.blamed: list[str] = []
-        self.begin_check: Callable[..., Any] = lambda jobs: None
+        self.begin_check: Callable[..., Any] = lambda *jobs: None
 
     def ready(self) -> int:
         return 0
@@ -109,10 +111,20 @@ def checked(driver: Driver) -> None:
         driver.receive(driver.source, driver.policy.on_factors)
 
 
+def begun(source: Messages, factors: FactorsTogether) -> SentMatrices | None:
+    """What they would be checked with as they come."""
+    return source.begin_check(factors.objects, factors.epochs, factors.steps, [factors.pattern] * len(factors))
+
+
 def checked_as_they_come(source: Messages, factors: FactorsTogether) -> FactorsTogether:
     """As the thread that copies them does."""
-    check = source.begin_check(list(zip(factors.objects, factors.steps, strict=True)))
-    return replace(factors, reasons=check(factors))
+    sent = begun(source, factors)
+    slot, size = np.concatenate(factors.values), factors.values[0].nbytes
+    begin = size * np.arange(len(factors))
+    taken = take_in(Parts(slot, begin), [factors.pattern] * len(factors), np.empty_like(slot), sent)
+    came = replace(factors, values=taken.values)
+    sent.end(came, taken)
+    return came
 
 
 def told(driver: Driver) -> list[tuple[Any, ...]]:
@@ -252,12 +264,21 @@ def test_a_verdict_on_a_matrix_that_is_not_there_any_more_counts_for_nothing(mon
 @pytest.mark.parametrize("sent", [None, "another step", "positions"])
 def test_without_the_matrix_of_each_they_are_checked_later(sent):
     driver, source = start()
-    step, values = driver.bodies[2].job.matrix
+    factors, (step, values) = made(driver), driver.bodies[2].job.matrix
     wrong = {None: None, "another step": (step + 1, values), "positions": (step, np.zeros((4, 3)))}
     driver.bodies[2].job.matrix = wrong[sent]
-    jobs = [(state.body.name, state.job.sent) for state in driver.bodies]
-    assert source.begin_check(jobs) is None and source.begin_check(jobs[:2]) is not None
-    assert source.begin_check([("nobody", step)]) is None
+    assert begun(source, factors) is None and begun(source, factors.of([0, 1])) is not None
+    assert begun(source, replace(factors.of([0]), objects=["nobody"])) is None
+
+
+def test_those_that_are_not_of_the_size_of_their_object_are_checked_later():
+    driver, source = start()
+    factors, sim = made(driver), driver.simulation
+    driver.check = FactorCheck(
+        {b.name: sim.system.body_pattern(b.first, b.last) for b in sim.world.bodies[1:]}
+        | {"bar0": sim.system.body_pattern(0, sim.world.bodies[1].last)}
+    )
+    assert begun(source, factors) is None and begun(source, factors.of([1, 2])) is not None
 
 
 def test_few_are_taken_one_by_one():

@@ -22,20 +22,25 @@ static bool deliver(GpuLoop& l, StepBatch& batch, int slots) {
     bool left = slots < l.mail_slot_count;
     char* next = batch.upload;
     int64_t count = 0;
+    void* over = nullptr;  // the last event that was found to have completed
     for (int k = 0; k < slots; ++k) {
         MailSlot& slot = l.mail_slots[k];
         if (!slot.pending && slot.posted.load(std::memory_order_relaxed)) slot.pending = slot.posted.exchange(nullptr);
         if (!slot.pending) continue;
-        if (slot.pending->event && !done(l, slot.pending->event)) {
-            left = true;
-            continue;
+        if (void* event = slot.pending->event; event && event != over) {  // mail of a batch has one event
+            if (!done(l, event)) {
+                left = true;
+                continue;
+            }
+            over = event;
         }
         std::memcpy(next, slot.pending->bytes, slot.size);
         batch.mail.copies[count++] = {(char*)slot.target, next, slot.size};
         next += (slot.size + 15) / 16 * 16;
         if (&slot == l.touch) std::memcpy(&l.touched, slot.pending->bytes, sizeof l.touched);  // n, its first member
         int64_t number = slot.pending->number;
-        slot.pending->taken.store(l.launched, std::memory_order_release);
+        slot.after = l.launched;
+        slot.pending->taken.store(slot.after, std::memory_order_release);
         slot.pending = nullptr;
         slot.taken.store(number, std::memory_order_release);
     }
@@ -344,15 +349,12 @@ int32_t wf_gpu_close(GpuLoop* loop) {
 
 int32_t wf_gpu_take_changes(GpuLoop* loop) { return begin(*loop) && take_changes(*loop); }
 DeviceChanges* wf_gpu_post_changes(GpuLoop* loop, DeviceChanges* changes) { return loop->changes.exchange(changes); }
-Mail* wf_gpu_post(GpuLoop* loop, MailSlot* slot, Mail* mail) {
-    Mail* before = slot->posted.exchange(mail);
-    loop->posted.store(1, std::memory_order_release);
-    return before;
-}
 
-// Posts mail into different slots. displaced: of each, 1: what was there was not taken
-void wf_gpu_post_all(GpuLoop* loop, int64_t count, MailSlot* const* slots, Mail* mail, uint8_t* displaced) {
-    for (int64_t k = 0; k < count; ++k) displaced[k] = slots[k]->posted.exchange(mail + k) != nullptr;
+// Posts mail into different slots, or takes back what is in them where `mail` is null. numbers: of the slots. displaced: of each, 1: what
+// was there was not taken
+void wf_gpu_post(GpuLoop* loop, int64_t count, const int64_t* numbers, Mail* mail, uint8_t* displaced) {
+    for (int64_t k = 0; k < count; ++k)
+        displaced[k] = loop->mail_slots[numbers[k]].posted.exchange(mail ? mail + k : nullptr) != nullptr;
     loop->posted.store(1, std::memory_order_release);
 }
 

@@ -15,7 +15,7 @@ from protocol.shared_memory.located import Located, address
 from sim_server.arrays import Float64, Int64
 from sim_server.backends.base import Due
 from sim_server.backends.gpu import structs
-from sim_server.backends.gpu.mailbox import DeviceMailbox, library
+from sim_server.backends.gpu.mailbox import DeviceMailbox, Mailboxes, library
 from sim_server.backends.gpu.structs import DEVICE_COPY, FRAME_COPIES, RECORD_TARGET
 from sim_server.backends.measured import Measured
 from sim_server.backends.ring_buffers import Reports
@@ -116,7 +116,7 @@ class DeviceLoop(Reports):
         self._slots = (structs.MailSlot * max(len(mailboxes), 1))()
         for slot, (target, size) in zip(self._slots, mailboxes, strict=False):
             slot.target, slot.size = target, size
-        self.mailboxes = [DeviceMailbox(loop, slot) for slot in self._slots]
+        self.mailboxes = [DeviceMailbox(loop, slot, place) for place, slot in enumerate(self._slots)]
         self._readbacks, block = (structs.BodyReadback * bodies)(), 9 * np.dtype(real).itemsize
         most = most_blocks or [int(row_start[last] - row_start[first]) for first, last in ranges]
         self._room = [block * count for count in most]  # bytes of the blocks of each body at most
@@ -210,6 +210,10 @@ class DeviceLoop(Reports):
         self.loop.pair_sums, self.loop.pair_counts = sums.ctypes.data, counts.ctypes.data
         self.loop.most_pairs = sums.shape[2]
 
+    def mailboxes_of_bodies(self, first: int) -> Mailboxes:
+        """Returns the mailboxes from number `first` on, one per body, in place of those that stand alone."""
+        return Mailboxes(self.loop, self._slots, first, len(self._ranges))
+
     # --- running ------------------------------------------------------------------------------------------------
 
     def use_graphs(
@@ -292,19 +296,18 @@ class DeviceLoop(Reports):
         one behind it leaves alone; None: where matrices are large, or of another type."""
         return self._memory_at(body, self._other_place(body)) if self._has_copy_memory else None
 
-    def request_matrices(self, bodies: Sequence[int]) -> list[Float64] | None:
+    def request_matrices(self, bodies: Int64) -> list[Float64] | None:
         """Requests the matrices of some bodies, each as `request_matrix` does for its `copy_memory`, and returns that
         memory; None, and requests none: where there is no such memory."""
         if not self._has_copy_memory:
             return None
         self._staging()
-        rows = np.array(bodies, np.int64)
-        places = self._other_places(rows)
-        self._staged_at[rows] = places
-        self._copied_steps[rows] = -1
-        self._requests[rows] = structs.REQUEST_VALUES  # last, as in `_request`
+        places = self._other_places(bodies)
+        self._staged_at[bodies] = places
+        self._copied_steps[bodies] = -1
+        self._requests[bodies] = structs.REQUEST_VALUES  # last, as in `_request`
         self.loop.requested = 1
-        return [self._memory_at(*each) for each in zip(rows.tolist(), places.tolist(), strict=True)]
+        return [self._memory_at(body, place) for body, place in zip(bodies.tolist(), places.tolist(), strict=True)]
 
     @property
     def _has_copy_memory(self) -> bool:
@@ -361,17 +364,21 @@ class DeviceLoop(Reports):
             target[...] = data.view(self._real).reshape(target.shape)
         return step
 
-    def matrix_steps(self, bodies: Sequence[int]) -> Int64:
+    def matrix_steps(self, bodies: Int64) -> Int64:
         """Returns the same of each of some bodies."""
         if not self._targets:
-            steps: Int64 = self._copied_steps[np.asarray(bodies, np.int64)]
+            steps: Int64 = self._copied_steps[bodies]
             return steps
-        return np.array([self.matrix_step(body) for body in bodies], np.int64)
+        return np.array([self.matrix_step(body) for body in bodies.tolist()], np.int64)
 
     def staged_matrix(self, body: int) -> int:
         """Returns the device address of the copy requested last, once it is complete: the same float64 values
         (blocks, 3, 3), until the next request. 0: there is none."""
-        staged = self.loop.staged
-        if not staged or self._copied_steps[body] < 0 or self._real != np.float64:
-            return 0
-        return int(staged) + int(self._staged_at[body])
+        return int(self.staged_matrices(np.array([body]))[0])
+
+    def staged_matrices(self, bodies: Int64) -> Int64:
+        """Returns the same of each of some bodies."""
+        if not self.loop.staged or self._real != np.float64:
+            return np.zeros(len(bodies), np.int64)
+        at: Int64 = np.where(self._copied_steps[bodies] < 0, 0, int(self.loop.staged) + self._staged_at[bodies])
+        return at

@@ -1,173 +1,122 @@
 // SPDX-License-Identifier: MIT
-// What one application of a factor says about it, beside one of block Jacobi. No loop calls this.
-//
-// Factors of one pattern are applied TOGETHER at a time. In a triangle of L each number waits for the one before, which takes most of
-// the time of a small factor; those of others are worked on meanwhile. Each gets the same bits as if it were alone.
+// Judges factors before they are used: those that came, and those of a message while they are copied out of shared memory. No loop calls
+// this.
+#include <algorithm>
 #include <atomic>
+#include <cstring>
 #include <exception>
 #include <thread>
 #include <vector>
 
-#include "pcg.h"
+#include "factor_judge.h"
 #include "sizes.h"
 
 namespace {
 
-enum Part { WITH_FACTOR = 1, WITH_BLOCK_JACOBI = 2 };
+constexpr int64_t PIECE = 16 << 10;  // bytes that are looked at while they are in the nearest cache
 
-constexpr int TOGETHER = 4;
+typedef uint64_t (*Hash)(const void*, size_t);
+// As largest_responses of digits.cpp.
+typedef void (*Responses)(int64_t, int64_t, const int32_t*, const int64_t*, const int32_t*, const int64_t*, const float* const*, double*,
+                          int32_t);
 
-// True if they are of one pattern, type and probe vector, so that they may be applied together.
-bool alike(const Factor& a, const Factor& b) {
-    const Pattern &p = *a.pattern, &q = *b.pattern;
-    return a.bytes == b.bytes && !p.plan && !q.plan && p.size == q.size && p.supernodes == q.supernodes &&
-           p.permutation == q.permutation && p.super_start == q.super_start && p.row_start == q.row_start && p.rows == q.rows &&
-           p.value_start == q.value_start;
+// A factor of a message.
+struct ArrivingFactor {
+    const char* source;  // its values in shared memory, which others may write to
+    char* target;        // where they are copied to: only that is looked at
+    int64_t bytes;
+    const Pattern* pattern;
+    const int32_t *row_start, *columns;  // of A, as of wf_judge_all
+    const double *matrix, *r;            // null: it is not judged
+    int32_t nodes, item;                 // bytes of a value: 4 or 8
+    // What is found:
+    uint64_t checksum;
+    int32_t finite, positive;  // all values, all on the diagonal
+    double judged[5];          // as out of wf_judge_all
+    double response;           // the largest, of a factor in float32
+};
+
+// True unless an exponent has all bits set: NaN or infinity.
+template <class Bits, Bits EXPONENT>
+bool all_finite(const char* data, int64_t bytes) {
+    typedef Bits Word __attribute__((may_alias));
+    const Word* words = reinterpret_cast<const Word*>(data);
+    Bits found = 0;
+    for (int64_t i = 0; i < bytes / int64_t(sizeof(Bits)); i++) found |= Bits((words[i] & EXPONENT) == EXPONENT);
+    return !found;
 }
 
-// s - a b, with one rounding where the processor can: else a compiler that works on one factor at a time would choose otherwise than
-// one that works on several.
 template <class T>
-T minus_product(T s, T a, T b) {
-#if defined(__FMA__) || defined(__ARM_FEATURE_FMA)
-    return std::fma(-a, b, s);
-#else
-    return s - a * b;
-#endif
-}
-
-// What one supernode does to other rows and what these do to it, but for its triangle. Not inlined, so that it has the same bits
-// wherever it is called: compilers choose which of two products they round.
-template <class T>
-__attribute__((noinline)) void forward(const Panel<T>& L, T* x, const int32_t* rows, T* y, T* scratch) {
-    if (L.columns == 3) forward_node(L, x, rows, y);
-    else forward_below(L, x, rows, y, scratch);
-}
-
-template <class T>
-__attribute__((noinline)) void backward(const Panel<T>& L, T* x, const int32_t* rows, const T* y, T* scratch) {
-    if (L.columns == 3) backward_node(L, x, rows, y);
-    else backward_below(L, x, rows, y, scratch);
-}
-
-// As apply_factor (supernodal.h), of several factors. work: (COUNT + 1) size entries
-template <class T, int COUNT>
-void apply_together(const Factor* factors, const double* r, double scale, double* const* z, T* work) {
-    const Pattern& p = *factors[0].pattern;
-    T *y[COUNT], *scratch = work + (int64_t)COUNT * p.size;
-    for (int f = 0; f < COUNT; ++f) {
-        y[f] = work + (int64_t)f * p.size;
-        for (int i = 0; i < p.size; ++i) y[f][i] = (T)(scale * r[p.permutation[i]]);
+bool all_positive(const Pattern& p, const char* data) {
+    bool found = true;
+    for (int s = 0; s < p.supernodes; ++s) {
+        const int columns = p.super_start[s + 1] - p.super_start[s];
+        const Panel<T> L{(const T*)data + p.value_start[s], columns, (int)(p.row_start[s + 1] - p.row_start[s])};
+        for (int k = 0; k < columns; ++k) found &= L.column(k)[k] > 0;
     }
-    auto panels = [&](int s, auto with) {
-        const int first = p.super_start[s], columns = p.super_start[s + 1] - first;
-        const int height = (int)(p.row_start[s + 1] - p.row_start[s]);
-        Panel<T> L[COUNT];
-        T* x[COUNT];
-        for (int f = 0; f < COUNT; ++f) {
-            L[f] = {(const T*)factors[f].values + p.value_start[s], columns, height};
-            x[f] = y[f] + first;
+    return found;
+}
+
+void copy(ArrivingFactor& f, Hash hash) {
+    bool finite = true;
+    for (int64_t at = 0; at < f.bytes; at += PIECE) {
+        const int64_t size = std::min(PIECE, f.bytes - at);
+        char* own = f.target + at;
+        std::memcpy(own, f.source + at, size_t(size));
+        finite &= f.item == 8 ? all_finite<uint64_t, 0x7ff0000000000000u>(own, size) : all_finite<uint32_t, 0x7f800000u>(own, size);
+    }
+    f.finite = finite;
+    if (hash) f.checksum = hash(f.target, size_t(f.bytes));
+    f.positive = f.item == 8 ? all_positive<double>(*f.pattern, f.target) : all_positive<float>(*f.pattern, f.target);
+}
+
+void estimate(ArrivingFactor& f, Responses responses) {
+    const Pattern& p = *f.pattern;
+    const float* values = (const float*)f.target;
+    responses(1, p.supernodes, p.super_start, p.row_start, p.rows, p.value_start, &values, &f.response, 1);
+}
+
+// Columns of factors that are judged once they are copied.
+struct Columns {
+    std::vector<Factor> factors;
+    std::vector<int32_t> nodes;
+    std::vector<const int32_t*> row_start, columns;
+    std::vector<const double*> values, r, applied;
+    std::vector<double> out;
+
+    Columns(const ArrivingFactor* each, int32_t count) : applied(count), out(5 * count) {
+        for (int32_t k = 0; k < count; ++k) {
+            const ArrivingFactor& f = each[k];
+            factors.push_back({f.pattern, f.target, 0, f.item});
+            nodes.push_back(f.nodes);
+            row_start.push_back(f.row_start), columns.push_back(f.columns);
+            values.push_back(f.matrix), r.push_back(f.r);
         }
-        with(L, x, p.rows + p.row_start[s], columns);
+    }
+    Given given(int32_t parts) {
+        return {(int32_t)factors.size(), parts, factors.data(), nodes.data(), row_start.data(), columns.data(), values.data(), r.data(),
+                applied.data(), out.data()};
+    }
+};
+
+// Calls work(first, some, memory) of each group of factors that are judged together; `threads` share the groups, this one among them,
+// each with `room` entries of memory.
+template <class Work>
+void share(const Given& given, double* memory, int64_t room, int32_t threads, Work work) {
+    std::vector<std::pair<int, int>> groups;
+    for (int i = 0, some; i < given.count; i += some) groups.emplace_back(i, some = given.together(i));
+    std::atomic<size_t> next{0};
+    auto do_next = [&](double* own) {
+        for (size_t k = next++; k < groups.size(); k = next++) work(groups[k].first, groups[k].second, own);
     };
-    for (int s = 0; s < p.supernodes; ++s)
-        panels(s, [&](const Panel<T>* L, T* const* x, const int32_t* rows, int columns) {
-            for (int k = 0; k < columns && columns != 3; ++k)
-                for (int f = 0; f < COUNT; ++f) {
-                    const T* c = L[f].column(k);
-                    T *own = x[f], xk = own[k] / c[k];
-                    own[k] = xk;
-                    for (int r = k + 1; r < columns; ++r) own[r] = minus_product(own[r], c[r], xk);
-                }
-            for (int f = 0; f < COUNT; ++f) forward(L[f], x[f], rows, y[f], scratch);
-        });
-    for (int s = p.supernodes - 1; s >= 0; --s)
-        panels(s, [&](const Panel<T>* L, T* const* x, const int32_t* rows, int columns) {
-            for (int f = 0; f < COUNT; ++f) backward(L[f], x[f], rows, y[f], scratch);
-            for (int k = columns - 1; k >= 0 && columns != 3; --k) {
-                const T* c[COUNT];
-                T sum[COUNT];
-                for (int f = 0; f < COUNT; ++f) c[f] = L[f].column(k), sum[f] = x[f][k];
-                for (int r = k + 1; r < columns; ++r)
-                    for (int f = 0; f < COUNT; ++f) sum[f] = minus_product(sum[f], c[f][r], x[f][r]);
-                for (int f = 0; f < COUNT; ++f) x[f][k] = sum[f] / c[f][k];
-            }
-        });
-    const double back = 1 / scale;
-    for (int f = 0; f < COUNT; ++f)
-        for (int i = 0; i < p.size; ++i) z[f][p.permutation[i]] = back * (double)y[f][i];
-}
-
-struct Body {
-    BlockCsr A;  // nodes numbered from 0; values null: unknown
-    const double* r;
-};
-
-// z and z.r of some factors that are alike. work: (COUNT + 1) n entries
-template <int COUNT>
-void apply(const Body* bodies, const Factor* factors, double* const* z, double* work, double* out) {
-    const double* r = bodies[0].r;
-    const int n = bodies[0].A.size();
-    const double scale = 1 / std::sqrt(dot(n, r, r));
-    if (factors[0].bytes == 4) apply_together<float, COUNT>(factors, r, scale, z, (float*)work);
-    else apply_together<double, COUNT>(factors, r, scale, z, work);
-    for (int f = 0; f < COUNT; ++f) out[5 * f] = dot(bodies[f].A, z[f], r);
-}
-
-// out of wf_judge_all of one body with values of A. z: P^-1 r. work: 5 n entries
-__attribute__((noinline)) void judge(int parts, const Body& body, const double* z, double* work, double* out) {
-    const BlockCsr& A = body.A;
-    const double* r = body.r;
-    const int n = A.size();
-    double *q = work, *jacobi = q + n, *inverse = jacobi + n;
-    if (parts & WITH_FACTOR) {
-        out[1] = multiply(A, z, q);
-        double left = 0;
-        for (int i = 0; i < n; ++i) left += (r[i] - q[i]) * (r[i] - q[i]);
-        out[4] = std::sqrt(left / dot(n, r, r));
+    std::vector<std::thread> others;
+    try {
+        for (int32_t k = 1; k < threads; k++) others.emplace_back(do_next, memory + k * room);
+    } catch (const std::exception&) {  // the system gives no more of them, or no memory: those that there are do it
     }
-    if (!(parts & WITH_BLOCK_JACOBI)) return;
-    invert_diagonal(A, true, inverse);
-    out[2] = apply_diagonal(A, inverse, r, jacobi);
-    out[3] = multiply(A, jacobi, q);
+    do_next(memory);
+    for (std::thread& each : others) each.join();
 }
-
-// What wf_judge_all is given.
-struct Given {
-    int32_t count, parts;
-    const Factor* factors;
-    const int32_t *nodes, *const *row_start, *const *columns;
-    const double *const *values, *const *r, *const *applied;
-    double* out;
-
-    // How many factors from the i-th on are applied together.
-    int together(int i) const {
-        bool all = i + TOGETHER <= count;
-        for (int f = 1; f < TOGETHER && all; ++f)
-            all = alike(factors[i], factors[i + f]) && r[i] == r[i + f] && !applied[i] && !applied[i + f];
-        return all ? TOGETHER : 1;
-    }
-
-    // Judges `some` factors from the i-th on.
-    void judge_some(int i, int some, double* work) const {
-        Body body[TOGETHER];
-        const double* z[TOGETHER];
-        double* made[TOGETHER];
-        const int64_t n = 3 * (int64_t)nodes[i];
-        for (int f = 0; f < some; ++f) {
-            body[f] = {{0, nodes[i + f], row_start[i + f], columns[i + f], values[i + f]}, r[i + f]};
-            z[f] = made[f] = work + f * n;
-        }
-        double *room = work + TOGETHER * n, *own = out + 5 * i;
-        if (parts & WITH_FACTOR) {
-            if (applied[i]) own[0] = dot(body[0].A, z[0] = applied[i], r[i]);
-            else if (some == TOGETHER) apply<TOGETHER>(body, factors + i, made, room, own);
-            else apply<1>(body, factors + i, made, room, own);
-        }
-        for (int f = 0; f < some; ++f)
-            if (values[i + f]) judge(parts, body[f], z[f], room, own + 5 * f);
-    }
-};
 
 }  // namespace
 
@@ -182,23 +131,26 @@ void wf_judge_all(int32_t count, int32_t parts, const Factor* factors, const int
                   const int32_t* const* columns, const double* const* values, const double* const* r, const double* const* applied,
                   double* work, double* out, int64_t room, int32_t threads) {
     const Given given = {count, parts, factors, nodes, row_start, columns, values, r, applied, out};
-    std::vector<std::pair<int, int>> groups;  // the first of some that are applied together, and their number
-    for (int i = 0, some; i < count; i += some) groups.emplace_back(i, some = given.together(i));
-    std::atomic<size_t> next{0};
-    auto judge_next = [&](double* own) {
-        for (size_t k = next++; k < groups.size(); k = next++) given.judge_some(groups[k].first, groups[k].second, own);
-    };
-    std::vector<std::thread> others;
-    try {
-        for (int32_t k = 1; k < threads; k++) others.emplace_back(judge_next, work + k * room);
-    } catch (const std::exception&) {  // the system gives no more of them, or no memory: those that there are do it
-    }
-    judge_next(work);
-    for (std::thread& each : others) each.join();
+    share(given, work, room, threads, [&](int first, int some, double* own) { given.judge_some(first, some, own); });
+}
+
+// Copies factors out of shared memory, and finds what they show: those that were sent with A, whose `matrix` all have or none has,
+// are judged in all parts. hash: of bytes; null: it is not asked for. responses: likewise. work, room, threads: as of wf_judge_all.
+void wf_take_in(ArrivingFactor* each, int32_t count, Hash hash, Responses responses, double* work, int64_t room, int32_t threads) {
+    Columns columns(each, count);
+    const Given given = columns.given(WITH_FACTOR | WITH_BLOCK_JACOBI);
+    share(given, work, room, threads, [&](int first, int some, double* own) {
+        for (int k = first; k < first + some; ++k) copy(each[k], hash);
+        if (each[first].matrix) given.judge_some(first, some, own);
+        for (int k = first; k < first + some; ++k) {
+            std::copy_n(&columns.out[5 * k], 5, each[k].judged);
+            if (responses && each[k].item == 4) estimate(each[k], responses);
+        }
+    });
 }
 
 const StructSize* wf_sizes() {
-    static const StructSize sizes[] = {SIZE(Factor), SIZE(Pattern), {}};
+    static const StructSize sizes[] = {SIZE(Factor), SIZE(Pattern), SIZE(ArrivingFactor), {}};
     return sizes;
 }
 }

@@ -54,6 +54,17 @@ def largest_responses(pattern: FactorPattern, values: Sequence[NDArray[np.floati
     return found
 
 
+def response_function() -> int:
+    """Address of `largest_responses` of digits.cpp, for other native code. Raises CompileError."""
+    return c.cast(library().largest_responses, c.c_void_p).value or 0
+
+
+def planes_by(responses: Float64) -> list[int]:
+    """Returns the float16 numbers per entry that inverses need, by the largest response of each (k,)."""
+    good = (responses <= MOST_RESPONSE).tolist()
+    return [1 if each else 2 for each in good]
+
+
 def _contiguous(values: NDArray[np.floating]) -> NDArray[np.float32]:
     known = isinstance(values, Located) and values.dtype == np.float32 and values.flags.c_contiguous
     return values if known else np.ascontiguousarray(values, np.float32)
@@ -65,7 +76,7 @@ def planes_of(factors: Sequence[tuple[FactorPattern, NDArray[np.floating]]]) -> 
     planes = [1] * len(factors)
     for pattern in dict.fromkeys(pattern for pattern, _ in factors):
         places = [place for place, (own, _) in enumerate(factors) if own is pattern]
-        good = largest_responses(pattern, [factors[k][1] for k in places]) <= MOST_RESPONSE
-        for k in np.flatnonzero(~good).tolist():
-            planes[places[k]] = 2
+        needed = planes_by(largest_responses(pattern, [factors[k][1] for k in places]))
+        for place, own in zip(places, needed, strict=True):
+            planes[place] = own
     return planes
