@@ -33,42 +33,42 @@ class ManyFactors:
         self._driver = driver
 
     def begin_check(
-        self, objects: Sequence[str], epochs: Sequence[int], steps: Sequence[int], patterns: Sequence[FactorPattern]
+        self, objects: Sequence[str], epochs: Sequence[int], patterns: Sequence[FactorPattern],
+        matrices: Sequence[Float64],
     ) -> SentMatrices | None:  # fmt: skip
-        """Returns what factors that arrive are checked with: the matrices that were sent; None: that must wait until
-        they are adopted. From any thread; of a job that is over meanwhile it may be another matrix, and what is found
-        counts for nothing (`_still_sent`)."""
-        matrices: list[Float64] = []
-        for name, step in zip(objects, steps, strict=True):
-            state = self._driver.by_name.get(name)
-            sent = None if state is None else state.job.matrix
-            if sent is None or sent[0] != step or sent[1].ndim != 3:
-                return None
-            matrices.append(sent[1])
-        bodies = self._driver.check.bodies(objects, epochs, patterns)
+        """Returns what factors that arrive are checked with; None: that must wait until they are adopted. From any
+        thread; of a job that is over meanwhile another matrix may be written to the memory of its own, and what is
+        found counts for nothing (`_still_sent`)."""
+        driver = self._driver
+        bodies = driver.check.bodies(objects, epochs, patterns)
         if bodies is None:
             return None
-        by_name = dict(zip(objects, matrices, strict=True))
-        return SentMatrices(bodies, matrices, self._driver.engine.response_function(), partial(self._note, by_name))
+        return SentMatrices(bodies, matrices, driver.engine.response_function(), self._note)
 
     def _still_sent(self, factors: FactorsTogether, rows: Sequence[int]) -> list[bool]:
         """Returns of which factors the matrix is still there that was sent. rows: their bodies"""
         sent = [self._driver.bodies[row].job.matrix for row in rows]
         return [own is not None and own[0] == step for own, step in zip(sent, factors.steps, strict=True)]
 
-    def _note(self, matrices: Mapping[str, Float64], factors: FactorsTogether, taken: TakenIn) -> None:
+    def _note(self, factors: FactorsTogether, taken: TakenIn) -> None:
         """Takes note of what was found about factors that arrived, and has those that are good made ready for use."""
-        factors.reasons = self._driver.reasons(len(factors), self._judged, matrices, factors, taken)
+        factors.reasons = self._driver.reasons(len(factors), self._judged, factors, taken)
 
-    def _judged(self, matrices: Mapping[str, Float64], factors: FactorsTogether, taken: TakenIn) -> list[str]:
+    def _judged(self, factors: FactorsTogether, taken: TakenIn) -> list[str]:
         driver = self._driver
-        sent = [matrices[name] for name in factors.objects]
-        reasons = driver.check.reasons(factors, sent, taken.found["judged"])
+        reasons = driver.check.reasons(factors, taken.found["judged"])
         factors.planes = driver.engine.planes_by(factors, taken.found["response"])
         good = factors if not any(reasons) else factors.of([k for k, why in enumerate(reasons) if not why])
         if len(good) >= MANY:
-            driver.engine.prepare_together([driver.by_name[name].body.index for name in good.objects], good)
+            driver.engine.prepare_together(self._bodies(good).tolist(), good)
         return reasons
+
+    def _bodies(self, factors: FactorsTogether) -> Int64:
+        """Returns the numbers of the bodies of factors."""
+        if factors.bodies is None:
+            by_name = self._driver.by_name
+            factors.bodies = np.array([by_name[name].body.index for name in factors.objects], np.int64)
+        return factors.bodies
 
     def adopt(self, factors: FactorsTogether) -> None:
         """Gives the loop factors that were checked, or begins to check them beside the caller. Few that were not, and
