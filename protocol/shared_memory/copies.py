@@ -16,7 +16,7 @@ import numpy as np
 import xxhash
 from numpy.typing import NDArray
 
-from protocol.shared_memory.located import address
+from protocol.shared_memory.located import address, addresses
 from protocol.validate import ALONE, checksum, copied, helping_threads
 
 SOURCE = Path(__file__).with_name("copies.cpp")
@@ -90,6 +90,18 @@ class Copies:
         if any(s.nbytes != t.nbytes or not t.flags.c_contiguous for s, t in zip(sources, targets, strict=True)):
             raise ValueError("a target is not contiguous, or not of the bytes of its source")
         return self._call(_addresses(sources), _addresses(targets), size, own_sources)
+
+    def gather(self, sources: Sequence[NDArray[Any]], target: NDArray[np.uint8]) -> list[int]:
+        """Copies arrays one behind the other to the begin of a target. Returns the `checksum` of each copy. Raises
+        ValueError if there is no room for them."""
+        if not all(each.flags.c_contiguous for each in sources):
+            sources = [np.ascontiguousarray(each) for each in sources]
+        size = np.array([each.nbytes for each in sources], np.int64)
+        parts = Parts(target, np.cumsum(size) - size)
+        if self._library is None:
+            pairs = zip([each.reshape(-1).view(np.uint8) for each in sources], parts.split(size), strict=True)
+            return [copied(source, part, part)[0] for source, part in pairs]
+        return self._call(addresses(sources), parts.addresses(size), size, False)
 
     def copy_parts(
         self, source: Parts, target: Parts, size: NDArray[np.int64], own_sources: bool = False

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What is noted of the answers of workers: of factors that passed all checks, and of others. For one thread at a time."""
+"""What is noted of answers of workers: of factors that passed all checks, and of others. For one thread at a time."""
 
 from collections.abc import Callable, Sequence
 

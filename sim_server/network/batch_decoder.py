@@ -73,7 +73,8 @@ class Expected(NamedTuple):
         """Returns some of them."""
         if len(rows) == len(self.answers):
             return self
-        return Expected(self.batch, *([column[row] for row in rows] for column in self[1:]))
+        columns: Any = ([column[row] for row in rows] for column in self[1:])
+        return Expected(self.batch, *columns)
 
     def begin(self, begin_check: BeginCheck) -> SentMatrices | None:
         """Returns what the factors are checked with; None: they are checked later."""
@@ -124,8 +125,8 @@ def _expected(
 ) -> tuple[Expected, list[tuple[int, Refused]]]:  # fmt: skip
     """Returns the answers that are as expected, and why others are refused."""
     batch, objects = jobs[0].batch, decoder.objects
-    item, rooms, epochs = np.dtype(batch.dtype).itemsize, batch.rooms.tolist(), batch.epochs
-    slot = batch.factor_slot
+    slot, item, epochs = batch.factor_slot, np.dtype(batch.dtype).itemsize, batch.epochs
+    rooms = [room or (slot.capacity if slot else 0) for room in batch.rooms.tolist()]
     lent = slot is not None and columns.slot == (slot.segment, slot.offset, batch.factor_generation)
     found: list[tuple[int, int, int, AnnouncedObject, FactorPattern]] = []
     refused: list[tuple[int, Refused]] = []
@@ -138,7 +139,9 @@ def _expected(
             found.append((k, place, row, known, pattern))
         else:
             refused.append((k, _why(decoder, columns, place, job, pattern)))
-    return Expected(batch, *map(list, zip(*found, strict=True))) if found else Expected(batch, [], [], [], [], []), refused
+    return Expected(batch, *map(list, zip(*found, strict=True))) if found else Expected(
+        batch, [], [], [], [], []
+    ), refused
 
 
 def _why(

@@ -62,6 +62,7 @@ class BatchIntake:
         self._beside: set[int] = set()  # numbers of jobs whose factors are taken in
         self._under_way: Arrived | None = None  # in the thread
         self._done: deque[Arrived | Refused] = deque()  # oldest first
+        self._working = threading.Lock()  # held while a message is taken in
         self._ring = session.declare_subscriber(key("factors", server), RingChannel(WAITING))
         threading.Thread(target=self._serve, name="factors of messages", daemon=True).start()
 
@@ -85,17 +86,22 @@ class BatchIntake:
                 sample = self._ring.recv()
             except zenoh.ZError:  # the session was closed
                 return
-            try:
-                self._done.append(self._arrived(sample))
-            except Refused as refusal:
-                self._done.append(refusal)
-            except Exception as error:  # whatever a message holds, the run goes on
-                self._done.append(self._counters.unexpected(error, f"a message {str(sample.key_expr)[:200]!r}"))
-            self._under_way = None
+            with self._working:
+                self._take_in(sample)
             self.wake()
 
+    def _take_in(self, sample: zenoh.Sample) -> None:
+        """Takes a message in. Whatever it holds, the run goes on."""
+        try:
+            self._done.append(self._arrived(sample))
+        except Refused as refusal:
+            self._done.append(refusal)
+        except Exception as error:
+            self._done.append(self._counters.unexpected(error, f"a message {str(sample.key_expr)[:200]!r}"))
+        self._under_way = None
+
     def _arrived(self, sample: zenoh.Sample) -> Arrived:
-        """Takes a message in, as far as it answers jobs that are waited for."""
+        """Returns a message with the factors that answer jobs which are waited for."""
         message = self._book.decoder.parse_batch(sample.key_expr, sample.attachment)
         arrived = Arrived(message, self._book.clock())
         self._match(arrived)
@@ -112,8 +118,8 @@ class BatchIntake:
         waited, found = self._book.leases.by_object, [flying.get(number) for number in numbers]
         batch, seen = next((job.batch for job in found if job is not None), None), set[int]()
         for place, (number, job) in enumerate(zip(numbers, found, strict=True)):
-            current = job is not None and job.batch is batch and waited.get(job.object) is job
-            if current and number not in seen and number not in self._beside and not (failures and failures[place]):
+            first = number not in seen and number not in self._beside and not (failures and failures[place])
+            if first and job is not None and job.batch is batch and waited.get(job.object) is job:
                 seen.add(number)
                 arrived.jobs.append(job)
                 arrived.told.append(place)
@@ -139,6 +145,13 @@ class BatchIntake:
         """Number of messages that `take` could take now. Patterns that came before these messages are there."""
         return len(self._done)
 
+    def finish(self) -> None:
+        """Takes all messages that have come, also those that wait for the thread, before a worker is forgotten."""
+        with self._working:
+            while (sample := self._ring.try_recv()) is not None:
+                self._take_in(sample)
+        self.take(self.done)
+
     def take(self, count: int) -> None:
         """Takes the factors of the oldest messages, unless their jobs are over, and notes why others did not pass."""
         for _ in range(count):
@@ -150,8 +163,8 @@ class BatchIntake:
             numbers = {job.number for job in arrived.jobs}
             others = self._matched(arrived) if arrived.others else []
             self._beside -= numbers
-            if arrived.jobs or others:
-                self._take(arrived, others)
+            if jobs := [*arrived.jobs, *(job for _, job in others)]:
+                self._answers.guarded(jobs, partial(self._take, arrived, others))
 
     def _matched(self, arrived: Arrived) -> list[tuple[int, InFlightJob]]:
         """Returns place and job of the other answers that are of a job in flight and the first to it."""

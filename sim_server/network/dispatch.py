@@ -7,7 +7,8 @@ factor_intake.py; all of them share what is known of workers and jobs (bookkeepi
 
 import logging
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from typing import Any
 
 import zenoh
@@ -26,7 +27,8 @@ from sim_server.network.factor_decoder import FactorDecoder
 from sim_server.network.factor_intake import FactorIntake
 from sim_server.network.inbox import Inbox
 from sim_server.network.job_sender import JobSender
-from sim_server.network.leases import InFlightJob, Leases
+from sim_server.network.jobs_in_flight import InFlightJob
+from sim_server.network.leases import Leases
 from sim_server.network.native_copies import compile_ahead
 from sim_server.network.send_queue import SendQueue
 from sim_server.network.worker_choice import WorkerChoice
@@ -81,11 +83,11 @@ class Dispatch(FactorSource):
         self._inbox = Inbox(session, server)
         self._token_query_due = 0.0
         self._looked_at = -LOOK_PERIOD  # at which leases were looked through
+        self._received = False  # within a round whose messages were taken in
         self._on_message: dict[str, Callable[[zenoh.Sample], None]] = {
             "worker": self._on_heartbeat,
             "pattern": self._on_pattern,
             "factor": self._intake.on_factor,
-            "factors": self._intake.on_factors,
             "alive_worker": self._on_token,
         }
 
@@ -96,7 +98,7 @@ class Dispatch(FactorSource):
 
     def wake_by(self, wake: Callable[[], None]) -> None:
         """Has `wake` called, in another thread, when a factor that is taken in beside the caller is there."""
-        self._intake.wake = wake
+        self._intake.wake_by(wake)
 
     def makes_slots(self) -> bool:
         """True while shared memory for arrays is being made beside the caller."""
@@ -144,6 +146,17 @@ class Dispatch(FactorSource):
         with self._lock:
             return self._registry.unclaimed_tokens
 
+    @contextmanager
+    def round(self) -> Iterator[None]:
+        """Takes in all messages that arrived at the begin of a round of calls, and no more within it."""
+        with self._lock:
+            self._receive()
+            self._received = True
+        try:
+            yield
+        finally:
+            self._received = False
+
     def ready(self) -> int:
         """Number of jobs that workers can take now: one of each idle worker, more where all objects are small."""
         with self._lock:
@@ -170,15 +183,13 @@ class Dispatch(FactorSource):
         """Returns the factors that arrived and passed all checks since the last call."""
         with self._lock:
             together = self.poll_together()
-            factors, self._intake.factors = self._intake.factors, []
-            return [*factors, *(factor for each in together for factor in each)]
+            return [*self._intake.alone(), *(factor for each in together for factor in each)]
 
     def poll_together(self) -> list[FactorsTogether]:
         """Returns those of messages of several; the next `poll` returns the others."""
         with self._lock:
             self._receive()
-            together, self._intake.together = self._intake.together, []
-            return together
+            return self._intake.together()
 
     def patterns(self) -> list[tuple[str, FactorPattern]]:
         """Returns (object, pattern) of the patterns that came since the last call; each comes before its factors."""
@@ -199,7 +210,7 @@ class Dispatch(FactorSource):
 
     def check_with(self, begin: BeginCheck) -> None:
         """Has factors of messages checked in the thread that copies them."""
-        self._intake.begin_check = begin
+        self._intake.batches.begin_check = begin
 
     def worker_count(self) -> int:
         """Number of workers that may be given jobs, idle or busy."""
@@ -258,7 +269,10 @@ class Dispatch(FactorSource):
     # ---- messages from workers -------------------------------------------------------------------------------
 
     def _receive(self) -> None:
-        """Takes in all messages that arrived, refuses malformed ones, and ends leases."""
+        """Takes in all messages that arrived, refuses malformed ones, and ends leases. Once in a `round`."""
+        if self._received:
+            return
+        batches = self._intake.batches.done  # whose patterns came before them, and are read now
         for channel, sample in self._inbox:
             try:
                 self._on_message[channel](sample)
@@ -267,14 +281,13 @@ class Dispatch(FactorSource):
             except Exception as error:  # whatever a message holds, the run goes on
                 self._counters.refuse(self._counters.unexpected(error, f"a message {str(sample.key_expr)[:200]!r}"))
         try:
-            self._intake.take_decoded()
+            self._intake.take_decoded(batches)
         except Exception as error:
             self._counters.refuse(self._counters.unexpected(error, "factors taken in beside the caller"))
         self._sender.give_back_sent()
         self._query_tokens()
         if self._clock() >= self._looked_at + LOOK_PERIOD:  # many jobs are submitted one after another
             self._looked_at = self._clock()
-            self._sender.forget_sent()
             self._end_leases()
 
     def _end_leases(self) -> None:
@@ -282,12 +295,12 @@ class Dispatch(FactorSource):
         for job in self.leases.expire(self._clock(), self._intake.is_decoded):
             self._counters.add("leases_over")
             self._on_expired(job, "was not answered within its lease")
-        for job in self.leases.expire_undelivered(self._sent_at, self._registry.idle_period):
+        for job in self.leases.expire_undelivered(self._put_at, self._registry.idle_period):
             self._counters.add("jobs_lost")
             self._on_expired(job, f"was lost: worker {job.worker} says that it has no job")
 
-    def _sent_at(self, job: InFlightJob) -> float:
-        return float("inf") if self._intake.is_decoded(job) else self._sender.sent_at(job)
+    def _put_at(self, job: InFlightJob) -> float:
+        return float("inf") if self._intake.is_decoded(job) else job.put_at
 
     def _on_expired(self, job: InFlightJob, why: str) -> None:
         self._sender.forget_link(job.worker)  # zenoh may have dropped the job
@@ -320,6 +333,8 @@ class Dispatch(FactorSource):
                 self._counters.warn("worker_copies", f"worker {name} has no shared memory with us, arrays are copied")
 
     def _remove_worker(self, name: str) -> None:
+        if self.leases.count(name):
+            self._intake.batches.finish()  # it may have answered before it left
         self._sender.forget_link(name)
         self._counters.add("jobs_lost", self._book.remove_worker(name))
 

@@ -12,15 +12,14 @@ import zenoh
 from protocol.counters import Counters
 from protocol.factor import Factor
 from protocol.messages_pb2 import Factor as FactorMessage
-from protocol.messages_pb2 import FactorBatch
 from protocol.refused import Refused
 from protocol.shared_memory.pool import Slot, SlotPool
 from sim_server.backends.factors_together import FactorsTogether
-from sim_server.network.batch_decoder import DecodedFactors, decode_several
+from sim_server.network.answers import Answers
+from sim_server.network.batch_intake import BatchIntake
 from sim_server.network.bookkeeping import Bookkeeping
 from sim_server.network.factor_fetch import AHEAD, FactorFetch
-from sim_server.network.leases import InFlightJob
-from sim_server.updates.take_in import BeginCheck
+from sim_server.network.jobs_in_flight import InFlightJob
 
 T = TypeVar("T")
 
@@ -187,8 +186,10 @@ class FactorIntake:
 
     # ---- factors that are there ------------------------------------------------------------------------------
 
-    def take_decoded(self) -> None:
-        """Takes the large factors that were decoded beside the caller, unless their jobs are over."""
+    def take_decoded(self, batches: int) -> None:
+        """Takes the factors that were decoded beside the caller, unless their jobs are over. batches: number of
+        messages of several"""
+        self.batches.take(min(batches, self.batches.done))
         for number in self._fetches:
             job, fetch = self._decoding[number].job, self._decoding[number].fetch
             if fetch is not None and self._book.leases.by_object.get(job.object) is not job:

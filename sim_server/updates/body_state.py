@@ -7,10 +7,10 @@ from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from protocol.factor import Factor
 from protocol.method import Method
+from sim_server.arrays import Float64, Int64
 from sim_server.backends.rosenbrock import FORMS
 from sim_server.mechanics.world import Body
 from sim_server.updates.autotune.preconditioner import PreconditionerTuner
@@ -80,23 +80,28 @@ class JobState:
     """
 
     in_flight, checked, excess_sent = Cell(), Cell(), Cell()
+    request, requested, extrapolated, positions = Cell(), Cell(), Cell(), Cell()
 
     def __init__(self, table: UpdateTable, index: int):
         self._table, self._index = table, index
-        self.copy: NDArray[np.float64] | None = None
-        self.request, self.requested, self.extrapolated = 0, 0.0, 0.0
-        self.matrix: tuple[int, NDArray[np.float64]] | None = None
-        self.positions = False
 
-    def set_copy(self, copy: NDArray[np.float64] | None) -> None:
+    @property
+    def copy(self) -> Float64 | None:
+        return self._table.copies[self._index]
+
+    def set_copy(self, copy: Float64 | None) -> None:
         """Takes note of the memory that the loop is asked to copy into; None: the copy is given up."""
-        self.copy, self._table.copying[self._index] = copy, copy is not None
+        self._table.copies[self._index], self._table.copying[self._index] = copy, copy is not None
 
-    def on_sent(self, step: int) -> None:
-        """Takes note that the copy was sent, but for what stands in the table."""
-        copy, self.copy = self.copy, None
-        self.matrix = None if copy is None else (step, copy)
-        self.positions = copy is not None and copy.ndim == 2
+    @property
+    def matrix(self) -> tuple[int, Float64] | None:
+        held = self._table.matrices[self._index]
+        return None if held is None else (self._table.matrix_steps.item(self._index), held)
+
+    @matrix.setter
+    def matrix(self, matrix: tuple[int, Float64] | None) -> None:
+        step, held = (NONE, None) if matrix is None else matrix
+        self._table.matrix_steps[self._index], self._table.matrices[self._index] = step, held
 
     @property
     def sent(self) -> int | None:
@@ -118,11 +123,11 @@ class FailureState:
     reported: causes that the log has
     """
 
-    in_a_row, refused = Cell("failures"), Cell()
+    in_a_row, refused, assemblies = Cell("failures"), Cell(), Cell()
 
     def __init__(self, table: UpdateTable, index: int):
         self._table, self._index = table, index
-        self.assemblies, self.reason = 0, ""
+        self.reason = ""
         self.reported: set[str] = set()
 
 
@@ -134,20 +139,18 @@ class FactorStatistics:
     kept: the newest one, under policies by which a run repeats
     latency: steps from a matrix to its factor
     cost, cost_by_method: of a factorization [s, or operations]
-    methods, workers: of the last jobs, and of the last factors, by step
+    methods: of the last jobs by step, where methods are chosen
     """
 
-    newest, used = Cell(), Cell()
+    newest, used, regularized = Cell(), Cell(), Cell()
 
     def __init__(self, table: UpdateTable, index: int):
         self._table, self._index = table, index
-        self.regularized = 0
         self.kept: Factor | None = None
         self._dropped: tuple[int, int] | None = None
         self.latency, self.cost = MeanCell(table.latency, index), MeanCell(table.cost, index)
         self.cost_by_method: dict[str, RunningMean] = {}
         self.methods: dict[int, Method] = {}
-        self.workers: dict[int, str] = {}
 
     @property
     def dropped(self) -> tuple[int, int] | None:
@@ -168,7 +171,12 @@ class FactorStatistics:
 
     def worker(self, step: int) -> str:
         """Returns who made the factor of a step; empty if that is not remembered."""
-        return self.workers.get(step, "")
+        return self._table.makers.worker(self._index, step)
+
+    @property
+    def workers(self) -> dict[int, str]:
+        """Who made the last factors, by step."""
+        return self._table.makers.of(self._index)
 
     def method_cost(self, method: Method) -> float:
         """Returns the mean cost of a factorization by a method [s, or operations]; 0 if there was none."""
@@ -180,16 +188,16 @@ class FactorStatistics:
         self.cost.add(cost)
         self.newest = factor.step
         self.used += 1
-        self.note(factor.step, factor.worker, cost, bool(factor.remedy))
+        self.regularized += bool(factor.remedy)
+        self._table.makers.note(np.array([self._index]), np.array([factor.step]), [factor.worker])
+        self.note_method(factor.step, cost)
 
-    def note(self, step: int, worker: str, cost: float, regularized: bool) -> None:
-        """Remembers of a factor what stands in no table."""
+    def note_method(self, step: int, cost: float) -> None:
+        """Remembers what a factor has cost by the method of its job."""
         if (method := self.methods.get(step)) is not None:
             if (mean := self.cost_by_method.get(method.name)) is None:
                 mean = self.cost_by_method[method.name] = RunningMean()
             mean.add(cost)
-        _remember(self.workers, step, worker)
-        self.regularized += regularized
 
 
 class BodyUpdateState:
@@ -219,13 +227,12 @@ class BodyUpdateState:
 
     def on_job(self, step: int, method: Method) -> None:
         """Takes note that the matrix of a step is to be factorized."""
-        _remember(self.factors.methods, step, method)
         if self.tuner is not None:
+            _remember(self.factors.methods, step, method)
             self.tuner.factorization.on_sent()
 
     def on_sent(self, step: int) -> None:
         """Takes note that the copy of `step` was sent. It is kept until its factor came, which is checked with it."""
-        self.job.on_sent(step)
         on_sent(self._table, [self._index], [step])
 
     def on_factor(self, factor: Factor, step: int) -> bool:
@@ -300,18 +307,27 @@ class BodyUpdateState:
             self.solves.max_factor_age = max(self.solves.max_factor_age, int(record["step"]) - 1 - factor_step)
 
 
-def on_requests(states: Sequence[BodyUpdateState], copies: Sequence[NDArray[np.float64]]) -> None:
-    """Takes note of the memory that the loop is asked to copy the matrices of different bodies of one table into."""
-    for state, copy in zip(states, copies, strict=True):
-        state.job.copy = copy
-    states[0]._table.copying[[state._index for state in states]] = True
+def on_requests(table: UpdateTable, rows: Int64, copies: Sequence[Float64], first: int, now: float) -> None:
+    """Takes note of the memory that the loop is asked to copy the matrices of different bodies into. first: number of
+    the first request, in their order. now: [s, monotonic]"""
+    for row, copy in zip(rows.tolist(), copies, strict=True):
+        table.copies[row] = copy
+    table.copying[rows] = True
+    table.request[rows], table.requested[rows] = np.arange(first, first + len(rows)), now
+    table.extrapolated[rows] = 0.0
 
 
-def on_sent(table: UpdateTable, rows: Sequence[int], steps: Sequence[int]) -> None:
-    """Takes note of copies that were sent, of some steps, in what the table has of them."""
-    row = np.asarray(rows, np.int64)
-    table.in_flight[row], table.copying[row], table.sent[row] = True, False, steps
-    table.excess_sent[row], table.excess[row] = table.excess[row], 0.0
+def on_sent(table: UpdateTable, bodies: Sequence[int] | Int64, steps: Sequence[int] | Int64) -> None:
+    """Takes note of copies that were sent, of some steps. They are kept until their factors came."""
+    rows, copies = np.asarray(bodies, np.int64), table.copies
+    sent = [copies[row] for row in rows.tolist()]
+    for row, copy in zip(rows.tolist(), sent, strict=True):
+        table.matrices[row], copies[row] = copy, None
+    table.positions[rows] = [copy is not None and copy.ndim == 2 for copy in sent]
+    table.sent[rows] = steps
+    table.matrix_steps[rows] = np.where([copy is None for copy in sent], NONE, table.sent[rows])
+    table.in_flight[rows], table.copying[rows] = True, False
+    table.excess_sent[rows], table.excess[rows] = table.excess[rows], 0.0
 
 
 def on_checks(table: UpdateTable, rows: Sequence[int], steps: Sequence[int]) -> None:
@@ -338,20 +354,22 @@ class MadeFactors(NamedTuple):
         return cls([factor.step for factor in factors], [factor.seconds for factor in factors], workers, regularized)
 
 
-def on_factors(states: Sequence[BodyUpdateState], table: UpdateTable, made: MadeFactors, step: int) -> list[bool]:
+def on_factors(states: Sequence[BodyUpdateState], bodies: Int64, made: MadeFactors, step: int) -> list[bool]:
     """Takes note of factors of different bodies, as BodyUpdateState.on_factor does of each, with costs in seconds.
+    Returns of each whether it is newer than that of its body.
 
-    table: that of the states. step: during which they came
+    states: of all bodies of one table. step: during which they came
     """
-    costs, bodies = [max(each, MIN_SECONDS) for each in made.seconds], [state._index for state in states]
-    newer = table.on_factors(np.array(bodies, np.int64), np.array(made.steps, np.int64), np.array(costs), step)
-    noted = zip(states, made.steps, made.workers, costs, made.regularized, newer, strict=True)
-    for state, own, worker, cost, regularized, better in noted:
-        if state.job.positions:
-            state.failures.assemblies = 0
-        if better:
-            state.factors.note(own, worker, cost, regularized)
-    return newer
+    table, steps, costs = states[0]._table, np.array(made.steps, np.int64), np.maximum(made.seconds, MIN_SECONDS)
+    newer = np.array(table.on_factors(bodies, steps, costs, step), np.bool_)
+    table.assemblies[bodies[table.positions[bodies]]] = 0
+    own, places = bodies[newer], np.flatnonzero(newer).tolist()
+    table.makers.note(own, steps[newer], [made.workers[k] for k in places])
+    table.regularized[own] += np.array(made.regularized, np.int64)[newer]
+    if states[0].tuner is not None:
+        for k in places:
+            states[bodies[k]].factors.note_method(made.steps[k], float(costs[k]))
+    return list(newer.tolist())
 
 
 def _remember(table: dict[int, Any], step: int, value: Any) -> None:

@@ -16,7 +16,7 @@ from protocol.refused import Refused
 from protocol.validate import checksum
 from sim_server.network import batch_decoder as module
 from sim_server.network.factor_decoder import FactorDecoder
-from sim_server.network.leases import InFlightJob
+from tests.support.in_flight import batch_in_flight
 from tests.worker.block_matrices import bar_edges, pattern, spd
 
 GRAPHS = [pattern(12, bar_edges(1, 1, 2)), pattern(8, bar_edges(1, 1, 1))]
@@ -40,13 +40,13 @@ class Memory:
 
 @pytest.fixture
 def stage() -> SimpleNamespace:
-    """decoder, slot, message, answers (place and job of each object), and values by object."""
+    """decoder, slot, message, batch of jobs, and values by object."""
     decoder, slot = FactorDecoder(7), Memory()
     message = FactorBatch(
         header=Header(protocol=PROTOCOL, incarnation=7), worker="w",
         slot=SlotMessage(segment=slot.segment, offset=slot.offset, capacity=slot.capacity, generation=3),
     )  # fmt: skip
-    answers, values = [], {}
+    values = {}
     for place, (name, kind) in enumerate(KINDS.items()):
         (row_start, columns), made = GRAPHS[kind], MADE[kind]
         header = Header(protocol=PROTOCOL, incarnation=7, object=name, epoch=1)
@@ -56,24 +56,23 @@ def stage() -> SimpleNamespace:
         decoder.add_pattern(key("pattern", worker="w", object=name), made.pattern.message(header).SerializeToString())
         values[name] = made.factorize(spd(*GRAPHS[kind], seed=place), np.float32)
         slot.part(place * ROOM, np.float32, len(values[name]))[:] = values[name]
-        job = InFlightJob(
-            place + 1, name, 1, 5, True, "float32", "w", 9.0, factor_slot=slot, factor_generation=3,  # type: ignore[arg-type]
-            first=place * ROOM, room=ROOM,
-        )  # fmt: skip
-        answers.append((place, job))
-        message.jobs.append(job.number)
+        message.jobs.append(place + 1)
         message.patterns.append(made.pattern.id)
         message.nonzeros.append(len(values[name]))
         message.checksums.append(checksum(values[name]))
         message.seconds.append(0.25)
-    return SimpleNamespace(decoder=decoder, slot=slot, message=message, answers=answers, values=values)
+    batch = batch_in_flight(
+        range(1, len(KINDS) + 1), list(KINDS), 1, 5, "float32", "w", 9.0, factor_slot=slot, factor_generation=3,
+        first=np.arange(len(KINDS)) * ROOM, rooms=np.full(len(KINDS), ROOM),
+    )  # fmt: skip
+    return SimpleNamespace(decoder=decoder, slot=slot, message=message, batch=batch, values=values)
 
 
 def refused(stage: SimpleNamespace) -> dict[str, str]:
     """Kinds of refusals by object; the others must have their own values."""
     kinds = {}
     found = decoded(stage)
-    for (_, job), each in zip(stage.answers, found, strict=True):
+    for job, each in zip(stage.batch.jobs, found, strict=True):
         if isinstance(each, Refused):
             kinds[job.object] = each.kind
         else:
@@ -85,12 +84,12 @@ def refused(stage: SimpleNamespace) -> dict[str, str]:
 
 def decoded(stage: SimpleNamespace) -> list[Factor | Refused]:
     """The factor of each answer, or why it is refused."""
-    good, refused = module.decode_several(stage.decoder, stage.message, stage.answers)
+    good, refused = module.decode_several(stage.decoder, stage.message, stage.batch.jobs, range(len(KINDS)))
     found = dict(refused)
     for places, factors in good:
         assert len(places) == len(factors) and not found.keys() & set(places)
         found |= dict(zip(places, factors, strict=True))
-    return [found[k] for k in range(len(stage.answers))]
+    return [found[k] for k in range(len(KINDS))]
 
 
 def test_they_are_copied_one_behind_the_other_into_memory_of_few_sizes(stage, monkeypatch):
@@ -137,11 +136,26 @@ def test_a_value_that_no_factor_has_costs_the_others_nothing(stage, number, kind
 
 
 def test_one_that_has_no_room_of_its_own_is_refused_alone(stage):
-    stage.answers[1][1].room = 64
+    stage.batch.rooms[1] = 64
     assert refused(stage) == {"b": "slot"}
-    stage.answers[3][1].factor_generation = 4
-    stage.answers[4][1].factor_slot = None
-    assert refused(stage) == {"b": "slot", "d": "slot", "e": "slot"}
+
+
+@pytest.mark.parametrize("slot", ["none", "another"])
+def test_those_of_a_slot_that_was_not_lent_are_refused(stage, slot):
+    if slot == "none":
+        stage.batch.factor_slot = None
+    else:
+        stage.batch.factor_generation = 4
+    assert refused(stage) == dict.fromkeys(KINDS, "slot")
+
+
+def test_answers_may_come_in_any_order_and_some_of_them_alone(stage):
+    jobs = [stage.batch.jobs[k] for k in (3, 1, 4)]
+    good, refused = module.decode_several(stage.decoder, stage.message, jobs, [3, 1, 4])
+    assert refused == [] and [factors.objects for _, factors in good] == [["d", "b", "e"]]
+    assert [places for places, _ in good] == [[0, 1, 2]]
+    for factors in good[0][1]:
+        np.testing.assert_array_equal(factors.values, stage.values[factors.object])
 
 
 def test_of_an_object_that_was_split_meanwhile_nothing_is_taken(stage):
