@@ -7,7 +7,7 @@ from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from itertools import count
 from types import SimpleNamespace
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,6 +15,7 @@ import pytest
 from sim_server.backends.compiler import CompileError
 from sim_server.backends.gpu import factor_upload as module
 from sim_server.backends.gpu.factor_upload import FactorUpload
+from sim_server.backends.gpu.upload import inverse_builds, inverse_posts
 from tests.backends.fake_cuda import FakeScene
 
 
@@ -27,11 +28,6 @@ class Event:
 
     def synchronize(self) -> None:
         self._device.record(self.ptr)
-
-
-class PartitionedInverse(NamedTuple):
-    storage: list[int]
-    event: Event
 
 
 class NoMemory(MemoryError):
@@ -85,9 +81,7 @@ class Maker:
     spared, planes = 8, None
     most = 3  # inverses that are built together
 
-    def build_many(
-        self, values: list[np.ndarray], storages: list[list[int]], multiprocessors: int | None
-    ) -> list[PartitionedInverse]:
+    def build_many(self, values: list[np.ndarray], storages: list[list[int]], multiprocessors: int | None) -> Event:
         if self.fail:
             raise self.fail
         assert 0 < len(values) == len(storages) <= self.most
@@ -95,33 +89,39 @@ class Maker:
         self.events.append(Event(self.scene))
         for each, storage in zip(values, storages, strict=True):
             storage[:] = [int(each[0])]
-        return [PartitionedInverse(storage, self.events[-1]) for storage in storages]
+        return self.events[-1]
 
-    def reserve_vectors(self, body: int, plan: Any) -> bool:
-        new = (body, id(plan)) not in self.reserved
+    def thread_blocks(self, bodies: np.ndarray) -> list[int]:
+        return [1] * len(bodies)
+
+    def without_vectors(self, bodies: list[int], plan: Any) -> list[int]:
+        return [row for row, body in enumerate(bodies) if (body, id(plan)) not in self.reserved]
+
+    def reserve_vectors(self, body: int, plan: Any) -> None:
         self.reserved.add((body, id(plan)))
-        return new
 
     def wait(self) -> None:
         """Stands for the default stream's end of work, in which vectors are made."""
         self.waits.append(len(self.events))
 
-    def apply(self, inverse: PartitionedInverse, r: np.ndarray, multiprocessors: int | None = None) -> np.ndarray:
+    def apply(self, storage: list[int], r: np.ndarray, multiprocessors: int | None = None) -> np.ndarray:
         """In place of a factor the number that it is."""
-        return r / inverse.storage[0]
+        return r / storage[0]
 
     def forget_plans(self, kept: set[tuple[int, int]]) -> None:
         self.known = kept
         self.each_known.append(kept)
 
     def use(
-        self, bodies: list[int], planned: list[SimpleNamespace], inverses: list[PartitionedInverse], planes: int,
-        steps: list[int],
-    ) -> None:  # fmt: skip
-        if self.unusable.intersection(bodies):
+        self, bodies: np.ndarray, planned: SimpleNamespace, storages: list[list[int]], planes: int, steps: list[int]
+    ) -> None:
+        if self.unusable.intersection(bodies.tolist()):
             raise NoMemory("no vectors")
-        self.bodies["factor"][bodies] = [each.storage[0] for each in inverses]
+        self.bodies["factor"][bodies] = [storage[0] for storage in storages]
         self.planes_used.append(planes)
+
+    def factor_rows(self, bodies: np.ndarray) -> np.ndarray:
+        return self.bodies["factor"][bodies].view(np.uint8).reshape(len(bodies), 8)
 
 
 PATTERN = SimpleNamespace(id=1)
@@ -129,20 +129,20 @@ PATTERN = SimpleNamespace(id=1)
 
 @pytest.fixture
 def parts(monkeypatch):
-    monkeypatch.setattr(module, "SETTINGS_BYTES", 8)
-    monkeypatch.setattr(module, "no_memory_left", lambda error: isinstance(error, NoMemory))
+    for each in (inverse_builds, inverse_posts):
+        monkeypatch.setattr(each, "no_memory_left", lambda error: isinstance(error, NoMemory))
     scene = FakeScene()
     maker = Maker(scene)
     stream = SimpleNamespace(synchronize=maker.wait)
     gpu = SimpleNamespace(cp=SimpleNamespace(cuda=SimpleNamespace(get_current_stream=lambda: stream)))
-    return scene, maker, FactorUpload(gpu, maker, scene.loop, ["beam"], scene.loop.mailboxes[1:2])
+    return scene, maker, FactorUpload(gpu, maker, scene.loop, ["beam"], scene.loop.mailboxes_of_bodies(1))
 
 
 def held_builds(maker: Maker) -> threading.Event:
     """Has builds of inverses wait until the event is set."""
     go, build = threading.Event(), maker.build_many
 
-    def slow(*arguments: Any) -> list[PartitionedInverse]:
+    def slow(*arguments: Any) -> Event:
         assert go.wait(30)
         return build(*arguments)
 
@@ -156,7 +156,7 @@ def post(upload: FactorUpload, value: int) -> None:
 
 def post_all(upload: FactorUpload, values: list[int]) -> None:
     """Of each body, one that is made of another value."""
-    upload.post_many([(body, PATTERN, np.array([value]), value) for body, value in enumerate(values)])
+    upload.post_many([(body, PATTERN, np.array([value]), value, 0) for body, value in enumerate(values)])
 
 
 def used(scene: FakeScene) -> list[int]:
@@ -219,15 +219,15 @@ def test_what_was_launched_with_a_factor_ends_before_its_storage_is_written_agai
     upload.settle()
     scene.loop.run(1)
     assert upload.step(0) == 2
-    scene.loop.loop.launched += 1  # as if a step were under way
-    uploads = upload._uploads[0]
-    uploads.leaving = (uploads.in_use, int(scene.loop.loop.launched))
     post(upload, 3)
-    assert [t[0] for t in maker.storages] == [1, 2]
-    scene.loop.loop.launched -= 1
-    uploads.leaving = (uploads.in_use, scene.loop.step)
-    upload.advance()
+    upload.settle()
+    scene.loop.run(1)
+    scene.loop.loop.step -= 2  # as if the steps that were launched before it was taken were under way
+    post(upload, 4)
     assert [t[0] for t in maker.storages] == [3, 2]
+    scene.loop.loop.step += 1
+    upload.advance()
+    assert [t[0] for t in maker.storages] == [3, 4]
 
 
 def test_nobody_waits_for_a_plan_and_the_newest_factor_wins(parts):
@@ -266,7 +266,7 @@ def test_large_factors_are_built_beside_the_caller(parts, monkeypatch):
     begun, callers = threading.Event(), []
     build = maker.build_many
 
-    def slow(*arguments: Any) -> list[PartitionedInverse]:
+    def slow(*arguments: Any) -> Event:
         callers.append(threading.current_thread())
         begun.wait(30)
         return build(*arguments)
@@ -379,7 +379,7 @@ def test_a_build_that_fails_leaves_those_that_are_under_way(many, caplog):
     maker, upload, boxes = many
     build, asked = maker.build_many, count(1)
 
-    def full(*arguments: Any) -> list[PartitionedInverse]:
+    def full(*arguments: Any) -> Event:
         if next(asked) == 2:
             raise NoMemory("full")
         return build(*arguments)
@@ -423,10 +423,10 @@ def test_plans_of_factors_that_were_made_together_are_kept_until_all_are_posted(
     """Else each but the first would be planned once more, and whoever posts would wait for it."""
     maker, upload, boxes = many
     kinds = [SimpleNamespace(id=number) for number in range(1, len(boxes) + 1)]
-    upload.post_many([(body, kind, np.array([kind.id]), 1) for body, kind in enumerate(kinds)])
+    upload.post_many([(body, kind, np.array([kind.id]), kind.id, 0) for body, kind in enumerate(kinds)])
     maker.thread.submit(lambda: None).result()
     upload.advance()
-    assert [box.posted for box in boxes] == [1] * len(boxes)
+    assert [box.posted for box in boxes] == [kind.id for kind in kinds]
     assert maker.each_known and all({(kind.id, 1) for kind in kinds} <= known for known in maker.each_known)
 
 
@@ -496,7 +496,7 @@ def test_an_inverse_is_built_while_its_digits_are_found_and_told_of_once_they_ar
     builds = maker.build_many
     maker.fine = {5} if fine else set()
 
-    def begun(*arguments: Any) -> list[PartitionedInverse]:
+    def begun(*arguments: Any) -> Event:
         found = builds(*arguments)
         went.set()
         return found
@@ -573,10 +573,9 @@ def many(parts, monkeypatch):
     scene, maker, _ = parts
     maker.bodies = np.zeros(module.MANY, maker.bodies.dtype)
     boxes = [Mailbox() for _ in maker.bodies]
-    monkeypatch.setattr(module, "post_all", Mailbox.post_all)
     stream = SimpleNamespace(synchronize=maker.wait)
     gpu = SimpleNamespace(cp=SimpleNamespace(cuda=SimpleNamespace(get_current_stream=lambda: stream)))
-    return maker, FactorUpload(gpu, maker, scene.loop, [f"beam{k}" for k in range(len(boxes))], boxes), boxes
+    return maker, FactorUpload(gpu, maker, scene.loop, [f"beam{k}" for k in range(len(boxes))], Boxes(boxes)), boxes
 
 
 class Mailbox:
@@ -584,13 +583,26 @@ class Mailbox:
 
     taken, posted, row, count = False, 0, b"", 0
 
-    @staticmethod
-    def post_all(
-        boxes: list["Mailbox"], data: np.ndarray, keep: list[Any], events: list[int]
-    ) -> list[SimpleNamespace]:  # fmt: skip
-        for box, row, kept in zip(boxes, data, keep, strict=True):
-            box.taken, box.posted, box.row, box.count = False, kept.step, row.tobytes(), box.count + 1
-        return [SimpleNamespace(taken=0) for _ in boxes]
+
+class Boxes:
+    """Such ones as mailbox.Mailboxes."""
+
+    def __init__(self, boxes: list[Mailbox]):
+        self.boxes = boxes
+
+    def __len__(self) -> int:
+        return len(self.boxes)
+
+    def post(self, bodies: np.ndarray, data: np.ndarray, event: Event, keep: Any) -> None:
+        for body, row in zip(bodies.tolist(), data, strict=True):
+            box = self.boxes[body]
+            box.taken, box.posted, box.row, box.count = False, int(row.view(np.int64)[0]), row.tobytes(), box.count + 1
+
+    def taken(self, bodies: np.ndarray) -> np.ndarray:
+        return np.array([self.boxes[body].taken for body in bodies.tolist()], bool)
+
+    def after(self, bodies: np.ndarray) -> np.ndarray:
+        return np.zeros(len(bodies), np.int64)
 
 
 def test_of_factors_that_come_faster_than_they_are_built_the_newest_wait(many, monkeypatch):
@@ -656,13 +668,13 @@ def test_many_are_posted_by_the_thread_that_builds_them(many):
 
 def test_what_fails_while_they_are_posted_is_told_to_who_serves_the_loop(many, monkeypatch):
     maker, upload, boxes = many
-    post, broken = module.post_all, RuntimeError("broken")
+    broken = RuntimeError("broken")
 
     def fails(*arguments: Any) -> Any:
         raise broken
 
     with monkeypatch.context() as patch:
-        patch.setattr(module, "post_all", fails)
+        patch.setattr(Boxes, "post", fails)
         post_all(upload, list(range(1, len(boxes) + 1)))
         maker.thread.submit(lambda: None).result()
     with pytest.raises(RuntimeError, match="broken"):
@@ -670,11 +682,11 @@ def test_what_fails_while_they_are_posted_is_told_to_who_serves_the_loop(many, m
     upload.advance()
     post_all(upload, values := [9] * len(boxes))
     maker.thread.submit(lambda: None).result()
-    assert [box.posted for box in boxes] == values and module.post_all is post
+    assert [box.posted for box in boxes] == values
 
 
-def given(boxes: list[Mailbox], step: int) -> list[tuple[int, Any, np.ndarray, int]]:
-    return [(body, PATTERN, np.array([step + body]), step + body) for body in range(len(boxes))]
+def given(boxes: list[Mailbox], step: int) -> list[tuple[int, Any, np.ndarray, int, int]]:
+    return [(body, PATTERN, np.array([step + body]), step + body, 0) for body in range(len(boxes))]
 
 
 @pytest.mark.parametrize("early", [True, False], ids=["posted before they are built", "after"])
@@ -691,7 +703,7 @@ def test_many_that_were_prepared_are_built_once_and_used_when_they_are_posted(ma
     if not early:
         assert [box.posted for box in boxes] == [0] * len(boxes), "nobody has posted them"
         upload.post_many(factors)
-    assert [box.posted for box in boxes] == [step for *_, step in factors] and len(maker.storages) == len(boxes)
+    assert [box.posted for box in boxes] == [step for *_, step, _ in factors] and len(maker.storages) == len(boxes)
 
 
 def test_of_many_that_were_prepared_what_is_dropped_or_replaced_is_not_used(many):
@@ -699,7 +711,7 @@ def test_of_many_that_were_prepared_what_is_dropped_or_replaced_is_not_used(many
     first, second = given(boxes, 10), given(boxes, 20)
     upload.prepare_many(first)
     maker.thread.submit(lambda: None).result()
-    for body, _, values, _ in first[:2]:
+    for body, _, values, *_ in first[:2]:
         upload.drop(body, values)
     upload.post_many(second[1:])  # those of the others are replaced, as their factors were never posted
     maker.thread.submit(lambda: None).result()
@@ -745,7 +757,7 @@ def test_what_is_posted_while_newer_ones_are_prepared_does_not_come_behind_them(
     for factors in (given(boxes, 10), newer):
         if alone:
             for each in factors:
-                upload.post(*each)
+                upload.post(*each[:4])
         else:
             upload.post_many(factors)
     go.set()
@@ -771,7 +783,7 @@ def test_few_are_not_prepared(many):
 def test_of_several_of_one_body_among_many_the_last_one_is_used(many):
     maker, upload, boxes = many
     given = [*range(len(boxes)), 0]
-    upload.post_many([(body, PATTERN, np.array([step]), step) for step, body in enumerate(given, 1)])
+    upload.post_many([(body, PATTERN, np.array([step]), step, 0) for step, body in enumerate(given, 1)])
     maker.thread.submit(lambda: None).result()
     upload.advance()
     assert [box.posted for box in boxes] == [len(given), *range(2, len(given))]

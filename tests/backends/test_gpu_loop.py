@@ -15,7 +15,7 @@ from sim_server.backends import ring_buffers
 from sim_server.backends.cpu.structs import REACTION, REACTION_KINDS
 from sim_server.backends.gpu import loop as loop_module
 from sim_server.backends.gpu.loop import BATCH, CAPACITY, FRAMES
-from sim_server.backends.gpu.mailbox import ChangeMailbox, post_all
+from sim_server.backends.gpu.mailbox import ChangeMailbox
 from sim_server.backends.gpu.structs import NEWTON_RESULT, PAIR_SUM, STAGE_RESULT
 from sim_server.backends.measured import Measured
 from sim_server.backends.rosenbrock import FORMS
@@ -300,32 +300,61 @@ def test_what_was_not_taken_can_be_withdrawn():
     assert scene.loop.records()["factor_step"].tolist() == [0, 10]
 
 
+class MailEvent:
+    """An event of a build as CuPy has it."""
+
+    def __init__(self, scene: FakeScene, done: bool):
+        self.ptr = scene.device.event()
+        scene.device.begin(self.ptr)
+        if done:
+            scene.device.record(self.ptr)
+
+
 def test_mail_that_is_posted_together_is_taken_as_if_it_were_posted_alone():
     """Each waits for its own event, what was not taken is replaced, and its memory lives as long as it is used."""
     scene = FakeScene(bodies=3)
-    boxes, event = scene.loop.mailboxes[3:], scene.device.event()
+    boxes, all_of_them = scene.loop.mailboxes_of_bodies(3), np.arange(3)
+    late, done = MailEvent(scene, done=False), MailEvent(scene, done=True)
 
-    def post(values: list[int], events: list[int]) -> list[Any]:
-        rows = np.array(values, np.int64)[:, None].view(np.uint8)
-        return post_all(boxes[:3], rows, [None] * 3, events)
+    def post(bodies: list[int], values: list[int], event: MailEvent) -> None:
+        boxes.post(np.array(bodies), np.array(values, np.int64)[:, None].view(np.uint8), event)
 
-    scene.device.begin(event)
-    done = scene.device.event()
-    scene.device.record(done)
-    first = post([5, 6, 7], [done] * 3)
-    second = post([8, 9, 10], [done, event, done])
+    post([0, 1, 2], [5, 6, 7], done)
+    post([2, 0], [10, 8], done)
+    post([1], [9], late)
     gc.collect()
     scene.loop.run(2)
-    assert [box.taken for box in boxes[:3]] == [True, False, True]
-    assert [mail.taken for mail in first] == [-1] * 3 and [mail.taken for mail in second] == [0, -1, 0]
-    scene.device.record(event)
+    assert boxes.taken(all_of_them).tolist() == [True, False, True]
+    scene.device.record(late.ptr)
     scene.loop.run(1)
-    assert [box.taken for box in boxes[:3]] == [True] * 3 and second[1].taken == 2
+    assert boxes.taken(all_of_them).all() and boxes.after(all_of_them).tolist() == [0, 2, 0]
     assert scene.loop.records()["factor_step"].reshape(3, 3).tolist() == [[8, 0, 10], [8, 0, 10], [8, 9, 10]]
-    post([11, 12, 13], [done] * 3)
-    boxes[0].post(number(14))
+
+
+def test_of_many_mailboxes_what_was_not_taken_can_be_withdrawn():
+    scene = FakeScene(bodies=2)
+    boxes, late = scene.loop.mailboxes_of_bodies(2), MailEvent(scene, done=False)
+    boxes.post(np.arange(2), np.array([[5], [6]], np.int64).view(np.uint8), late)
+    scene.loop.run(1)  # the loop holds them, but does not use them
+    assert boxes.withdraw(1) and not boxes.withdraw(1)
+    scene.device.record(late.ptr)
     scene.loop.run(1)
-    assert scene.factor.tolist() == [14, 12, 13]
+    assert not boxes.withdraw(0) and scene.factor.tolist() == [5, 0]
+
+
+def test_what_mail_of_bodies_points_to_lives_until_the_device_is_done_with_it():
+    """A step under way may use what was posted before the last mail."""
+    scene = FakeScene(bodies=2)
+    boxes, kept = scene.loop.mailboxes_of_bodies(2), list[weakref.ref]()
+    for value in range(4):
+        what = Held()
+        boxes.post(np.arange(2), np.full((2, 1), value).view(np.uint8), keep=what)
+        kept.append(weakref.ref(what))
+        del what
+        gc.collect()
+        assert [each() is not None for each in kept[-2:]] == [True] * len(kept[-2:])
+        scene.loop.run(1)
+    assert kept[0]() is None and scene.factor.tolist() == [3, 3]
 
 
 class Held:

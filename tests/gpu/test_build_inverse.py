@@ -188,10 +188,9 @@ def test_several_at_a_time_have_the_bits_of_each_alone(gpu, groups, planes, limi
     assert builder.most == 64
     for count in (1, 2, 4, 5, 21):
         storages = builder.several_storages(22) if pinned else [builder.storage() for _ in range(22)]
-        made = builder.build_many(values[:count], storages[:count], limit)
-        made[-1].event.synchronize()
-        for storage, inverse, (chunks, scale) in zip(storages, made, alone, strict=False):
-            assert inverse[:2] == (storage.matrix.data.ptr, storage.scale.data.ptr)
+        builder.build_many(values[:count], storages[:count], limit).synchronize()
+        for storage, (chunks, scale) in zip(storages[:count], alone, strict=False):
+            assert storage.target == (storage.matrix.data.ptr, storage.scale.data.ptr)
             assert np.array_equal(storage.matrix.get().view(np.uint16), chunks.view(np.uint16))
             assert np.array_equal(storage.scale.get(), scale)
         assert not any(storage.scale.get().any() for storage in storages[count:])
@@ -205,6 +204,6 @@ def test_as_many_at_a_time_as_fit_into_the_workspace(gpu):
     builder = InverseBuilder(gpu, shape, plan(shape, 132, 1), 64)
     assert 1 < builder.most < 64 and builder.most * builder._layout.size <= WORKSPACE
     storages = [builder.storage() for _ in range(builder.most)]
-    builder.build_many([values] * builder.most, storages, None)[0].event.synchronize()
+    builder.build_many([values] * builder.most, storages, None).synchronize()
     chunks = expanded(gpu, shape, values, builder.plan)[0]
     assert all(np.array_equal(storage.matrix.get().view(np.uint16), chunks.view(np.uint16)) for storage in storages)

@@ -7,7 +7,7 @@ The graph holds the launches of the scene and the persistent solver, whose stop 
 """
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future
 from contextlib import ExitStack
 from functools import partial
@@ -26,7 +26,7 @@ from sim_server.backends.gpu.central_difference import ESTIMATE_EVERY
 from sim_server.backends.gpu.cuda import CudaDevice
 from sim_server.backends.gpu.cupy_types import Graph
 from sim_server.backends.gpu.device import DeviceLaunch, Gpu
-from sim_server.backends.gpu.factor_upload import FactorUpload, Given
+from sim_server.backends.gpu.factor_upload import FactorUpload
 from sim_server.backends.gpu.helper import alone
 from sim_server.backends.gpu.host_results import HostResults
 from sim_server.backends.gpu.inverse.device_digits import is_large
@@ -42,6 +42,7 @@ from sim_server.backends.gpu.step_graphs import StepGraphs, handle
 from sim_server.backends.gpu.step_records import StepRecords
 from sim_server.backends.gpu.step_sequence import StepSequence
 from sim_server.backends.gpu.structs import DeviceChanges, Mail
+from sim_server.backends.gpu.upload.given_factor import Given
 from sim_server.backends.state import StateArray
 
 MOST_GRABS = 1024  # pushes and grabs at a time, of which forces are told
@@ -131,15 +132,16 @@ class GpuEngine(DeviceLoop):
     def _prepare_factors(self, given: EngineInput) -> None:
         """Posts the settings, and makes ready for factors."""
         bodies, arrays = len(given.ranges), given.arrays
-        upload = FactorUpload(self.gpu, self.solver, self, given.names, self.mailboxes[bodies : 2 * bodies])
+        mailboxes = self.mailboxes_of_bodies(bodies)
+        upload = FactorUpload(self.gpu, self.solver, self, given.names, mailboxes)
         kept = () if self.sequence.splits else given.ranges  # patterns of what is split change
         self._factor_upload = upload
         self._patterns = KnownPatterns(self.solver, upload.expect, kept, arrays["row_start"], arrays["columns"])
         self._expected: dict[int, Future[None]] = {}  # memory for factors that will come, by pattern
+        every = np.arange(bodies)
+        mailboxes.post(every, self.solver.factor_rows(every))
         for k in range(bodies):
-            row = self.solver.bodies[k : k + 1].tobytes()
-            self.mailboxes[k].post(row[:SETTINGS_BYTES])
-            self.mailboxes[bodies + k].post(row[SETTINGS_BYTES:])
+            self.mailboxes[k].post(self.solver.bodies[k : k + 1].tobytes()[:SETTINGS_BYTES])
 
     # --- running ------------------------------------------------------------------------------------------------
 
@@ -258,7 +260,7 @@ class GpuEngine(DeviceLoop):
     def post_factors(self, bodies: Sequence[int], factors: Sequence[Factor]) -> None:
         """Posts factors of different bodies, one of each; inverses of many are built beside the caller."""
         self._factor_upload.post_many(
-            [(body, f.pattern, f.values, f.step) for body, f in zip(bodies, factors, strict=True)]
+            (body, f.pattern, f.values, f.step, 0) for body, f in zip(bodies, factors, strict=True)
         )
 
     def response_function(self) -> int:
@@ -434,6 +436,7 @@ class GpuEngine(DeviceLoop):
         return super().records_and_reactions()
 
 
-def _given(bodies: Sequence[int], factors: FactorsTogether) -> list[Given]:
+def _given(bodies: Sequence[int], factors: FactorsTogether) -> Iterator[Given]:
     """Returns factors as their inverses are built."""
-    return list(zip(bodies, repeat(factors.pattern, len(bodies)), factors.values, factors.steps, strict=True))
+    planes = getattr(factors, "planes", None) or repeat(0)
+    return zip(bodies, repeat(factors.pattern), factors.values, factors.steps, planes)

@@ -34,7 +34,8 @@ static bool deliver(GpuLoop& l, StepBatch& batch, int slots) {
         next += (slot.size + 15) / 16 * 16;
         if (&slot == l.touch) std::memcpy(&l.touched, slot.pending->bytes, sizeof l.touched);  // n, its first member
         int64_t number = slot.pending->number;
-        slot.pending->taken.store(l.launched, std::memory_order_release);
+        slot.after = l.launched;
+        slot.pending->taken.store(slot.after, std::memory_order_release);
         slot.pending = nullptr;
         slot.taken.store(number, std::memory_order_release);
     }
@@ -327,15 +328,12 @@ int32_t wf_gpu_close(GpuLoop* loop) {
 
 int32_t wf_gpu_take_changes(GpuLoop* loop) { return begin(*loop) && take_changes(*loop); }
 DeviceChanges* wf_gpu_post_changes(GpuLoop* loop, DeviceChanges* changes) { return loop->changes.exchange(changes); }
-Mail* wf_gpu_post(GpuLoop* loop, MailSlot* slot, Mail* mail) {
-    Mail* before = slot->posted.exchange(mail);
-    loop->posted.store(1, std::memory_order_release);
-    return before;
-}
 
-// Posts mail into different slots. displaced: of each, 1: what was there was not taken
-void wf_gpu_post_all(GpuLoop* loop, int64_t count, MailSlot* const* slots, Mail* mail, uint8_t* displaced) {
-    for (int64_t k = 0; k < count; ++k) displaced[k] = slots[k]->posted.exchange(mail + k) != nullptr;
+// Posts mail into different slots, or takes back what is in them where `mail` is null. numbers: of the slots. displaced: of each, 1: what
+// was there was not taken
+void wf_gpu_post(GpuLoop* loop, int64_t count, const int64_t* numbers, Mail* mail, uint8_t* displaced) {
+    for (int64_t k = 0; k < count; ++k)
+        displaced[k] = loop->mail_slots[numbers[k]].posted.exchange(mail ? mail + k : nullptr) != nullptr;
     loop->posted.store(1, std::memory_order_release);
 }
 

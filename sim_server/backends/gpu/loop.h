@@ -34,7 +34,8 @@ struct MailSlot {               // bytes on the device that are replaced between
     int64_t size;
     std::atomic<Mail*> posted;
     Mail* pending;               // taken out of `posted`; its event has not completed yet
-    std::atomic<int64_t> taken;  // number of the mail that was copied to the device last
+    int64_t after;               // steps launched before the mail that was copied to the device last
+    std::atomic<int64_t> taken;  // number of that mail
 };
 
 struct DeviceCopy {             // new contents of an array on the device

@@ -15,7 +15,7 @@ from protocol.shared_memory.located import Located, address
 from sim_server.arrays import Float64, Int64
 from sim_server.backends.base import Due
 from sim_server.backends.gpu import structs
-from sim_server.backends.gpu.mailbox import DeviceMailbox, library
+from sim_server.backends.gpu.mailbox import DeviceMailbox, Mailboxes, library
 from sim_server.backends.gpu.structs import FRAME_COPIES, RECORD_TARGET
 from sim_server.backends.measured import Measured
 from sim_server.backends.ring_buffers import Reports
@@ -112,7 +112,7 @@ class DeviceLoop(Reports):
         self._slots = (structs.MailSlot * max(len(mailboxes), 1))()
         for slot, (target, size) in zip(self._slots, mailboxes, strict=False):
             slot.target, slot.size = target, size
-        self.mailboxes = [DeviceMailbox(loop, slot) for slot in self._slots]
+        self.mailboxes = [DeviceMailbox(loop, slot, place) for place, slot in enumerate(self._slots)]
         self._readbacks, block = (structs.BodyReadback * bodies)(), 9 * np.dtype(real).itemsize
         most = most_blocks or [int(row_start[last] - row_start[first]) for first, last in ranges]
         self._room = [block * count for count in most]  # bytes of the blocks of each body at most
@@ -198,6 +198,10 @@ class DeviceLoop(Reports):
         self._pairs_written = sums, counts
         self.loop.pair_sums, self.loop.pair_counts = sums.ctypes.data, counts.ctypes.data
         self.loop.most_pairs = sums.shape[2]
+
+    def mailboxes_of_bodies(self, first: int) -> Mailboxes:
+        """Returns the mailboxes from number `first` on, one per body, in place of those that stand alone."""
+        return Mailboxes(self.loop, self._slots, first, len(self._ranges))
 
     # --- running ------------------------------------------------------------------------------------------------
 

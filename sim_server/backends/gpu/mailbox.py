@@ -9,10 +9,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from sim_server.arrays import Int64
 from sim_server.backends.compiler import native
 from sim_server.backends.gpu import structs
+from sim_server.backends.gpu.cupy_types import Event
 
-MAIL = structs.LOOP.dtype("Mail")
+MAIL, SLOT = structs.LOOP.dtype("Mail"), structs.LOOP.dtype("MailSlot")
 
 
 @cache
@@ -24,7 +26,7 @@ def library() -> c.CDLL:
         {
             "wf_gpu_run": (c.c_int64, [loop, c.c_int64]), "wf_gpu_wait": (c.c_int32, [loop]),
             "wf_gpu_open": (c.c_int32, [loop]), "wf_gpu_renew": (c.c_int32, [loop]),
-            "wf_gpu_close": (c.c_int32, [loop]), "wf_gpu_post": (p, [loop, c.POINTER(structs.MailSlot), p]),
+            "wf_gpu_close": (c.c_int32, [loop]), "wf_gpu_post": (None, [loop, c.c_int64, p, p, p]),
             "wf_gpu_post_changes": (p, [loop, p]), "wf_gpu_take_changes": (c.c_int32, [loop]),
             "wf_gpu_start_balances": (None, [c.c_int64, *[p] * 6, c.c_int32, p, c.c_double, c.c_int32]),
         },
@@ -37,14 +39,6 @@ def library() -> c.CDLL:
 def _posting() -> Any:
     """The function that posts mail. It keeps Python's lock, which takes longer to get back than to post."""
     held = c.PyDLL(library()._name).wf_gpu_post
-    held.restype, held.argtypes = c.c_void_p, [c.c_void_p, c.c_void_p, c.c_void_p]
-    return held
-
-
-@cache
-def _posting_all() -> Any:
-    """Likewise, into several mailboxes."""
-    held = c.PyDLL(library()._name).wf_gpu_post_all
     held.restype, held.argtypes = None, [c.c_void_p, c.c_int64, *[c.c_void_p] * 3]
     return held
 
@@ -94,10 +88,12 @@ class DeviceMailbox:
     Keeps mail, and what its bytes point to, until no step under way uses it.
     """
 
-    def __init__(self, loop: structs.GpuLoop, slot: structs.MailSlot):
-        self.loop, self._slot, self.number = loop, slot, 0
-        self._own = _, self.address = c.addressof(loop), c.addressof(slot)
-        self.size = int(slot.size)
+    def __init__(self, loop: structs.GpuLoop, slot: structs.MailSlot, place: int):
+        """place: number of the slot among those of the loop."""
+        self._loop, self._slot, self.number = loop, slot, 0
+        self._place, self._displaced = c.c_int64(place), c.c_uint8()
+        self._own = c.addressof(loop), 1, c.addressof(self._place)
+        self._size = int(slot.size)
         self._used: Any = None  # mail in use
         self._waiting: Any = None  # mail posted, which may be in use since
         self._leaving: list[tuple[int, Any]] = []  # (steps after whose completion it is out of use, mail)
@@ -108,32 +104,27 @@ class DeviceMailbox:
         keep: objects that the bytes point to. event: handle of the event.
         The bytes are valid from the step after the result's `taken` steps, once that is not below 0.
         """
-        assert len(data) == self.size
+        assert len(data) == self._size
         self.number += 1
         memory = c.create_string_buffer(data, len(data))
         mail = structs.Mail(c.addressof(memory), event, self.number, -1)
-        displaced = bool(_posting()(*self._own, c.addressof(mail)))
-        self.note(displaced, (memory, mail, keep), self.loop.step, self.loop.launched)
-        return mail
-
-    def note(self, displaced: bool, kept: Any, step: int, launched: int) -> None:
-        """Keeps what was posted last.
-
-        displaced: what was posted before was not taken
-        step, launched: steps completed, and launched
-        """
-        if self._leaving:
-            self._leaving = [each for each in self._leaving if each[0] > step]
+        displaced, step = self._exchange(mail), self._loop.step
+        self._leaving = [each for each in self._leaving if each[0] > step]
         if not displaced and self._waiting is not None:  # it was taken: what was used before leaves after those steps
             if self._used is not None:
-                self._leaving.append((launched, self._used))
+                self._leaving.append((self._loop.launched, self._used))
             self._used = self._waiting
-        self._waiting = kept
+        self._waiting = (memory, mail, keep)
+        return mail
+
+    def _exchange(self, mail: structs.Mail | None) -> bool:
+        """Posts mail in place of what was posted before; True if that was not taken."""
+        _posting()(*self._own, None if mail is None else c.addressof(mail), c.addressof(self._displaced))
+        return bool(self._displaced.value)
 
     def withdraw(self) -> bool:
         """Takes back mail that was not copied to the device, while the loop stands still; True if there was any."""
-        back = bool(_posting()(*self._own, None))
-        back = back or bool(self._slot.pending)
+        back = self._exchange(None) or bool(self._slot.pending)
         self._slot.pending = None
         if back:
             self._waiting = None
@@ -145,26 +136,55 @@ class DeviceMailbox:
         return bool(self._slot.taken == self.number)
 
 
-def post_all(
-    boxes: Sequence[DeviceMailbox], data: NDArray[np.uint8], keep: Sequence[Any], events: Sequence[int]
-) -> list[structs.Mail]:  # fmt: skip
-    """Posts into different mailboxes of one loop, as DeviceMailbox.post does into each, by one call of native code.
+class Mailboxes:
+    """A row of mailboxes, one per body, into which mail for many bodies is posted at a time.
 
-    data: bytes of each, (boxes, bytes)
+    Mail for a body is posted once that before it was taken or withdrawn, except for the second one.
     """
-    count, data, loop = len(boxes), np.ascontiguousarray(data), boxes[0].loop
-    assert data.shape == (count, boxes[0].size)
-    memory: Any = (structs.Mail * count)()
-    displaced = np.empty(count, np.bool_)
-    for box in boxes:
-        box.number += 1
-    table: NDArray[Any] = np.frombuffer(memory, MAIL)
-    table["bytes"], table["event"] = data.ctypes.data + data.shape[1] * np.arange(count), events
-    table["number"], table["taken"] = [box.number for box in boxes], -1
-    slots = np.array([box.address for box in boxes], np.uintp)
-    own = c.addressof(loop), count, slots.ctypes.data, c.addressof(memory), displaced.ctypes.data
-    _posting_all()(*own)
-    mails, step, launched = list(memory), loop.step, loop.launched
-    for box, mail, kept, displaces in zip(boxes, mails, keep, displaced.tolist(), strict=True):
-        box.note(displaces, (data, mail, kept), step, launched)
-    return mails
+
+    def __init__(self, loop: structs.GpuLoop, slots: Any, first: int, count: int):
+        """slots: array of structs.MailSlot, all of the loop. first, count: those of this row"""
+        self._loop, self._first, self._count = loop, first, count
+        self._slots: NDArray[Any] = np.frombuffer(slots, SLOT)[first : first + count]
+        self._numbers = np.zeros(count, np.int64)  # of the mail posted last
+        self._kept: list[list[Any]] = [[None] * count, [None] * count]  # of the last mail and of that before it
+
+    def __len__(self) -> int:
+        return self._count
+
+    def post(self, bodies: Int64, data: NDArray[np.uint8], event: Event | None = None, keep: Any = None) -> None:
+        """Replaces the bytes of different bodies from the next batch on, or from the first one after an event has
+        completed. data: of each, (bodies, bytes). keep: objects that they point to"""
+        count, data = len(bodies), np.ascontiguousarray(data)
+        assert data.shape == (count, self._slots["size"][0])
+        self._numbers[bodies] += 1
+        mail = np.zeros(count, MAIL)
+        mail["bytes"], mail["event"] = data.ctypes.data + data.shape[1] * np.arange(count), event.ptr if event else 0
+        mail["number"], mail["taken"] = self._numbers[bodies], -1
+        (last, before), kept = self._kept, (data, mail, event, keep)
+        for body in bodies.tolist():
+            before[body], last[body] = last[body], kept
+        self._exchange(bodies, mail.ctypes.data)
+
+    def _exchange(self, bodies: Int64, mail: int | None) -> NDArray[np.bool_]:
+        """Posts mail, from this address on, in place of what was posted before; returns where that was not taken."""
+        places, displaced = bodies + self._first, np.empty(len(bodies), np.bool_)
+        _posting()(c.addressof(self._loop), len(bodies), places.ctypes.data, mail, displaced.ctypes.data)
+        return displaced
+
+    def withdraw(self, body: int) -> bool:
+        """Takes back mail that was not copied to the device, while the loop stands still; True if there was any."""
+        slot = self._slots[body]
+        back = bool(self._exchange(np.array([body]), None)[0]) or bool(slot["pending"])
+        slot["pending"] = 0
+        return back
+
+    def taken(self, bodies: Int64) -> NDArray[np.bool_]:
+        """Returns of which bodies the copy of the last mail to the device has begun."""
+        found: NDArray[np.bool_] = self._slots["taken"][bodies] == self._numbers[bodies]
+        return found
+
+    def after(self, bodies: Int64) -> Int64:
+        """Returns the steps launched before the last mail of bodies was copied: it is valid for those after."""
+        found: Int64 = self._slots["after"][bodies]
+        return found

@@ -38,6 +38,11 @@ def is_pinned(array: NDArray[Any] | DeviceValues) -> bool:
     return isinstance(array, DeviceValues) or (isinstance(array, PinnedArray) and array.flags.c_contiguous)
 
 
+def all_pinned(arrays: Sequence[NDArray[Any] | DeviceValues], dtype: np.dtype[Any]) -> bool:
+    """True if the device can read each of some arrays by itself, all of one type."""
+    return all(each.dtype == dtype and is_pinned(each) for each in arrays)
+
+
 def runs(arrays: Sequence[NDArray[Any] | DeviceValues]) -> list[tuple[int, int, int]]:
     """Returns the copies that put arrays one behind the other, one for arrays that lie so already: first byte of the
     target, address of the source, bytes."""

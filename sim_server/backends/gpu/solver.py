@@ -12,13 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from protocol.factor import FactorPattern
-from sim_server.arrays import Int32
+from sim_server.arrays import Int32, Int64
 from sim_server.backends.compiler import SOURCES
 from sim_server.backends.gpu.cupy_types import DeviceArray, KernelFunction
 from sim_server.backends.gpu.device import Gpu, compiled, options, own_headers
 from sim_server.backends.gpu.device_values import DeviceValues
 from sim_server.backends.gpu.helper import FarInverse, FarVectors, Helper
-from sim_server.backends.gpu.inverse.build_inverse import InverseBuilder, PartitionedInverse, builder_kernels
+from sim_server.backends.gpu.inverse.build_inverse import InverseBuilder, InverseStorage, builder_kernels
 from sim_server.backends.gpu.inverse.device_digits import LARGE, LargeFactors, digits_kernels
 from sim_server.backends.gpu.inverse.device_plan import DevicePlan, shared_bytes
 from sim_server.backends.gpu.inverse.digits import library as digits_library
@@ -291,6 +291,10 @@ class PcgSolver:
         made.add_done_callback(partial(self._forget_failed, key))
         return made
 
+    def thread_blocks(self, bodies: Int64) -> list[int]:
+        """Returns the thread blocks of bodies, of all GPUs, for which inverses are planned."""
+        return [self._blocks_of[body] for body in bodies.tolist()]
+
     @property
     def plans_made(self) -> bool:
         """True if no plan is being made."""
@@ -321,6 +325,11 @@ class PcgSolver:
         far = helper.plan(found) if helper else None
         return PlannedInverse(DevicePlan(self.gpu, found, 0 if self._helper else None, own), builder, far)
 
+    def without_vectors(self, bodies: Sequence[int], plan: DevicePlan) -> list[int]:
+        """Returns the rows of bodies that `reserve_vectors` makes vectors for."""
+        there, far, at = self._vectors, self._far_vectors, plan.address
+        return [row for row, body in enumerate(bodies) if (body, at) not in there and (body, at) not in far]
+
     def reserve_vectors(self, body: int, plan: DevicePlan) -> bool:
         """Allocates the vectors of solves of a body with factors of this plan, unless they are there; returns whether
         it did. From any thread; the caller has them complete before a step reads them."""
@@ -336,21 +345,25 @@ class PcgSolver:
         return True
 
     def use(
-        self, bodies: Sequence[int], planned: Sequence[PlannedInverse], inverses: Sequence[PartitionedInverse],
-        planes: int, steps: Sequence[int],
+        self, bodies: Int64, planned: PlannedInverse, storages: Sequence[InverseStorage], planes: int,
+        steps: Sequence[int],
     ) -> None:  # fmt: skip
-        """Writes factors into the host rows of bodies; each is in use once its row is uploaded."""
-        rows, chosen = self.bodies, list(bodies)
-        for body, made in zip(bodies, planned, strict=True):
-            if self._plan_in_row.get(body) is not made.plan:
-                self._use_plan(body, made.plan, planes)
-        rows["matrix"][chosen] = [each.matrix for each in inverses]
-        rows["scale"][chosen] = [each.scale for each in inverses]
-        rows["factor_step"][chosen], rows["helper"][chosen] = steps, 0
+        """Writes factors whose inverses have one plan into the host rows of bodies; each is in use once its row is
+        uploaded. steps: of their matrices"""
+        rows, each, in_row = self.bodies, bodies.tolist(), self._plan_in_row
+        for body in [body for body in each if in_row.get(body) is not planned.plan]:
+            self._use_plan(body, planned.plan, planes)
+        targets = np.array([storage.target for storage in storages], np.uint64)
+        rows["matrix"][bodies], rows["scale"][bodies] = targets[:, 0], targets[:, 1]
+        rows["factor_step"][bodies], rows["helper"][bodies] = steps, 0
         if self._helper:
-            for body, made, inverse in zip(bodies, planned, inverses, strict=True):
-                if inverse.far:
-                    self._use_far(body, made, inverse.far)
+            for body, storage in zip(each, storages, strict=True):
+                if storage.far:
+                    self._use_far(body, planned, storage.far)
+
+    def factor_rows(self, bodies: Int64) -> NDArray[np.uint8]:
+        """Returns the bytes of the host rows of bodies that tell their factors, (bodies, bytes)."""
+        return self.bodies[bodies].view(np.uint8).reshape(len(bodies), -1)[:, SETTINGS_BYTES:]
 
     def _use_plan(self, body: int, device_plan: DevicePlan, planes: int) -> None:
         """Has a body use factors of another plan."""

@@ -32,7 +32,7 @@ from sim_server.backends.gpu.inverse.expansion_batches import (
 from sim_server.backends.gpu.inverse.partition import COLUMNS, ROWS
 from sim_server.backends.gpu.inverse.plan import Plan
 from sim_server.backends.gpu.inverse.workspace import workspace
-from sim_server.backends.gpu.pinned import is_pinned, runs
+from sim_server.backends.gpu.pinned import all_pinned, runs
 
 FLOAT32 = np.dtype(np.float32)
 ALIGNMENT = 64  # numbers; 256 bytes, as of what is allocated alone
@@ -149,33 +149,36 @@ class InverseBuilder:
         multiprocessors: largest number that the build keeps busy, for whole milliseconds; a launch that needs only the
             others runs beside it. None: all of them; a launch that needs all then waits some 100 us now and then.
         """
-        return self.build_many([values], [storage], multiprocessors)[0]
+        event = self.build_many([values], [storage], multiprocessors)
+        return PartitionedInverse(*storage.target, event, storage.far)
 
     def build_many(
         self,
         values: Sequence[NDArray[np.floating] | DeviceValues],
         storages: Sequence[InverseStorage],
         multiprocessors: int | None,
-    ) -> list[PartitionedInverse]:  # fmt: skip
-        """Begins to build the inverses of up to `most` factors in the same launches; otherwise as `build`.
+    ) -> Event:  # fmt: skip
+        """Begins to build the inverses of up to `most` factors in the same launches; otherwise as `build`. Returns the
+        event after which all of them are complete.
 
         Each has the same bits as if it were built alone.
         """
         with self._workspace.lock:
             return self._begin(values, storages, multiprocessors)
 
-    def apply(self, inverse: PartitionedInverse, r: Float64, multiprocessors: int | None = None) -> Applied:
-        """Begins to apply an inverse that a build under way makes to r (n,); returns before it is complete."""
+    def apply(self, storage: InverseStorage, r: Float64, multiprocessors: int | None = None) -> Applied:
+        """Begins to apply an inverse that a build under way makes in a storage to r (n,); returns before it is
+        complete."""
         with self._workspace.lock:
             if self._application is None:
                 self._application = InverseApplication(self._gpu, self.plan)
             most = multiprocessors or self._gpu.properties["multiProcessorCount"]
-            return self._application.begin(inverse.matrix, inverse.scale, r, self._workspace.stream, most)
+            return self._application.begin(*storage.target, r, self._workspace.stream, most)
 
     def _begin(
         self, values: Sequence[NDArray[np.floating] | DeviceValues], storages: Sequence[InverseStorage],
         multiprocessors: int | None,
-    ) -> list[PartitionedInverse]:  # fmt: skip
+    ) -> Event:  # fmt: skip
         space, cp, count = self._workspace, self._gpu.cp, len(values)
         assert 0 < count <= self.most and count == len(storages)
         if space.copied is not None:
@@ -187,7 +190,7 @@ class InverseBuilder:
         size = HEAD + 4 * count * self._nonzeros
         graph, stream = self._graph(multiprocessors, next(c for c in COUNTS if c >= count)), space.stream
         at, copy, kind = int(space.incoming.data.ptr), cp.cuda.runtime.memcpyAsync, cp.cuda.runtime.memcpyHostToDevice
-        if all(each.dtype == FLOAT32 and is_pinned(each) for each in values):
+        if all_pinned(values, FLOAT32):
             copy(at, space.staging.ctypes.data, HEAD, kind, stream.ptr)
             for begin, source, length in runs(values):
                 copy(at + HEAD + begin, source, length, cp.cuda.runtime.memcpyDefault, stream.ptr)
@@ -201,8 +204,7 @@ class InverseBuilder:
             for each in storages:
                 if each.far:
                     self._helper.copy(each.far, each.matrix, each.scale, stream)
-        done = stream.record()
-        return [PartitionedInverse(*at, done, s.far) for at, s in zip(targets, storages, strict=True)]
+        return stream.record()
 
     def _graph(self, limit: int | None, count: int) -> Graph:
         """Returns the graph of a build of up to `count` inverses that keeps at most `limit` multiprocessors busy."""
