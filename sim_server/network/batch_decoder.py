@@ -111,10 +111,10 @@ def decode_several(
     sent = None if begin_check is None else found.begin(begin_check)
     taken = _taken(decoder, found, sent)
     wrong, method = _wrong(columns, found, taken), found.batch.method
-    rows: dict[FactorPattern, list[int]] = {}  # of good ones by pattern
+    rows: dict[int, list[int]] = {}  # of good ones by pattern
     for row, pattern in enumerate(found.patterns):
         if row not in wrong:
-            rows.setdefault(pattern, []).append(row)
+            rows.setdefault(pattern.id, []).append(row)
             decoder.note_size(found.known[row], pattern, found.batch.objects[found.places[row]], method)
     good = [_together(columns, found.of(own), taken.of(own), sent) for own in rows.values()]
     return DecodedFactors(good, [*refused, *((found.answers[row], why) for row, why in wrong.items())])

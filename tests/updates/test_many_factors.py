@@ -263,7 +263,7 @@ def test_a_verdict_on_a_matrix_that_is_not_there_any_more_counts_for_nothing(mon
 
 
 def test_those_that_are_not_of_the_size_of_their_object_are_checked_later():
-    driver, source = start()
+    driver, _ = start()
     factors, sim = made(driver), driver.simulation
     driver.check = FactorCheck(
         {b.name: sim.system.body_pattern(b.first, b.last) for b in sim.world.bodies[1:]}
