@@ -22,7 +22,7 @@ from sim_server.backends.gpu.structs import ENERGY_RECORD, RECORDS, STEP_RECORDS
 NOT_READY = 600
 p, size, u64 = c.c_void_p, c.c_size_t, c.c_uint64
 SIGNATURES = {
-    "context_set": [p], "graph_launch": [p, p], "to_host": [p, u64, size, p],
+    "context_set": [p], "graph_launch": [p, p], "to_device": [u64, p, size, p], "to_host": [p, u64, size, p],
     "on_device": [u64, u64, size, p], "event_record": [p, p], "event_query": [p], "event_wait": [p],
     "stream_wait": [p, p, c.c_uint32],
 }  # fmt: skip
@@ -89,6 +89,9 @@ class FakeDevice:
     def graph_launch(self, graph: int, stream: int) -> int:
         return self._put("graph_launch", stream, self.graphs[graph])
 
+    def to_device(self, to: int, source: int, count: int, stream: int) -> int:
+        return self._put("to_device", stream, lambda: c.memmove(to, source, count))  # type: ignore[arg-type,return-value]
+
     def to_host(self, to: int, source: int, count: int, stream: int) -> int:
         return self._put("to_host", stream, lambda: c.memmove(to, source, count))  # type: ignore[arg-type,return-value]
 
@@ -154,14 +157,14 @@ class FakeDevice:
 
 
 @cache
-def on_threads(declarations: Declarations, kernel: str, struct: str) -> c.CDLL:
-    """A kernel's text, run by threads of the processor: run(blocks, arguments)."""
+def on_threads(declarations: Declarations, call: str, struct: str) -> c.CDLL:
+    """A kernel's text, run by threads of the processor: run(blocks, a). call: of the kernel. struct: of a"""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         text = f"""#include "cuda_threads.h"
             {declarations.checked()}
             extern "C" void run(int blocks, const {struct}* a) {{
-                launch(blocks, THREADS, [&] {{ {kernel}(*a); }});
+                launch(blocks, THREADS, [&] {{ {call}; }});
             }}
             """
         (folder / "kernel.cpp").write_text(text)
@@ -177,13 +180,13 @@ def write_records(results: NDArray, energies: NDArray, loop: structs.GpuLoop, ta
     params["target"], params["results"], params["energies"] = target, results.ctypes.data, energies.ctypes.data
     params["records"], params["room"] = loop.records, loop.record_capacity
     params["capacity"], params["bodies"] = results.shape
-    on_threads(RECORDS, "write_records", "StepRecords").run(blocks, c.c_void_p(params.ctypes.data))
+    on_threads(RECORDS, "write_records(*a)", "StepRecords").run(blocks, c.c_void_p(params.ctypes.data))
 
 
 def make_copies(launch: structs.CopyLaunch) -> None:
-    """Makes the copies of a list as they stand now."""
-    count = c.c_int64.from_address(launch.count).value
-    for copy in (structs.DeviceCopy * count).from_address(launch.copies):
+    """Makes the copies of a list on the device."""
+    count, first = (c.c_int64 * 2).from_address(launch.target)
+    for copy in (structs.DeviceCopy * count).from_address(launch.target + first):
         c.memmove(copy.target, copy.source, copy.bytes)
 
 

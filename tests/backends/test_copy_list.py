@@ -13,11 +13,11 @@ EMPTY = 0xEE
 
 
 def make_copies(copies: list[tuple[int, int, int]], blocks: int, count: int | None = None) -> None:
-    """Makes copies (target, source, bytes); the list says that it has `count`."""
-    listed, number = np.array(copies, DEVICE_COPY), np.array([len(copies) if count is None else count], np.int64)
-    params = np.zeros((), COPY_LIST)
-    params["copies"], params["count"] = listed.ctypes.data, number.ctypes.data
-    on_threads(COPIES, "make_copies", "CopyList").run(blocks, c.c_void_p(params.ctypes.data))
+    """Makes copies (target, source, bytes); the list says that it has `count`. They come behind other contents."""
+    first = COPY_LIST.itemsize + 48
+    begin = np.array([(len(copies) if count is None else count, first)], COPY_LIST)
+    memory = np.frombuffer(begin.tobytes() + bytes(48) + np.array(copies, DEVICE_COPY).tobytes(), np.int64)
+    on_threads(COPIES, "make_copies(a)", "CopyList").run(blocks, c.c_void_p(memory.ctypes.data))
 
 
 @pytest.mark.parametrize("blocks", [1, 3, 7, 40])

@@ -14,13 +14,13 @@ template <class Word> __device__ __forceinline__ void copy_words(const DeviceCop
 }
 
 // The thread blocks share the copies: each makes one or more of them, or a part of one.
-extern "C" __global__ void __launch_bounds__(THREADS) make_copies(const CopyList a) {
-    const long long count = *(const volatile long long*)a.count;
+extern "C" __global__ void __launch_bounds__(THREADS) make_copies(const CopyList* list) {
+    const long long count = list->count;
     if (count <= 0) return;
+    const DeviceCopy* copies = (const DeviceCopy*)((const char*)list + list->first);
     const int blocks = (int)gridDim.x, parts = count < blocks ? blocks / (int)count : 1;
     for (long long k = blockIdx.x; k < count * parts; k += blocks) {
-        const volatile DeviceCopy& listed = a.copies[k / parts];
-        const DeviceCopy copy = {listed.target, listed.source, listed.bytes};
+        const DeviceCopy copy = copies[k / parts];
         const bool wide = (((unsigned long long)copy.target | (unsigned long long)copy.source | (unsigned long long)copy.bytes) & 7) == 0;
         if (wide) copy_words<unsigned long long>(copy, (int)(k % parts), parts);
         else copy_words<unsigned>(copy, (int)(k % parts), parts);

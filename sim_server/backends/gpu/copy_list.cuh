@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: MIT
-// Copies that the device makes in one launch (copy_list.cu), within its memory or from page-locked memory of the host.
+// Copies that the device makes in one launch (copy_list.cu), within its memory or out of the list.
 #pragma once
 
 struct DeviceCopy {
@@ -8,7 +8,7 @@ struct DeviceCopy {
     long long bytes;
 };
 
-struct CopyList {                     // its memory is page-locked: the host says what is to be copied
-    const DeviceCopy* copies;
-    const long long* count;
+struct CopyList {     // beginning of a list
+    long long count;
+    long long first;  // byte of the list at which the first copy stands; contents to be copied may come before it
 };

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: MIT
-"""Copies that the device makes in one launch, as lists in memory of the host say (copy_list.cu)."""
+"""Copies that the device makes in one launch, as lists say (copy_list.cu)."""
 
 import numpy as np
 
 from sim_server.backends.gpu.device import Gpu, compiled, options, own_headers, processors
-from sim_server.backends.gpu.structs import COPIES, COPY_LIST, CopyLaunch
+from sim_server.backends.gpu.structs import COPIES, CopyLaunch
 
 THREADS: int = COPIES.constant("THREADS")
 BLOCKS = 4  # of a launch, on each multiprocessor
@@ -20,6 +20,4 @@ class ListedCopies:
 
     def launch(self, made: CopyLaunch) -> None:
         """Appends the launch to the current stream. made: where the list is"""
-        params = np.zeros((), COPY_LIST)
-        params["copies"], params["count"] = made.copies, made.count
-        self._kernel((self._blocks,), (THREADS,), (params,))
+        self._kernel((self._blocks,), (THREADS,), (np.uint64(made.target),))

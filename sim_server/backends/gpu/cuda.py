@@ -16,7 +16,7 @@ from sim_server.backends.gpu.cupy_types import DeviceArray, Event, KernelModule,
 from sim_server.errors import DeviceError
 
 FUNCTIONS = {
-    "context_set": "cuCtxSetCurrent", "graph_launch": "cuGraphLaunch",
+    "context_set": "cuCtxSetCurrent", "graph_launch": "cuGraphLaunch", "to_device": "cuMemcpyHtoDAsync_v2",
     "to_host": "cuMemcpyDtoHAsync_v2", "on_device": "cuMemcpyDtoDAsync_v2", "event_record": "cuEventRecord",
     "event_query": "cuEventQuery", "event_wait": "cuEventSynchronize", "stream_wait": "cuStreamWaitEvent",
 }  # fmt: skip

@@ -20,8 +20,9 @@
 static bool deliver(GpuLoop& l, StepBatch& batch, int slots) {
     if (!l.posted.exchange(0, std::memory_order_acquire)) return true;
     bool left = slots < l.mail_slot_count;
-    char* next = batch.upload;
-    int64_t count = 0;
+    static thread_local std::vector<DeviceCopy> copies;
+    copies.clear();
+    int64_t used = sizeof(CopyList);
     void* over = nullptr;  // the last event that was found to have completed
     for (int k = 0; k < slots; ++k) {
         MailSlot& slot = l.mail_slots[k];
@@ -34,9 +35,9 @@ static bool deliver(GpuLoop& l, StepBatch& batch, int slots) {
             }
             over = event;
         }
-        std::memcpy(next, slot.pending->bytes, slot.size);
-        batch.mail.copies[count++] = {(char*)slot.target, next, slot.size};
-        next += (slot.size + 15) / 16 * 16;
+        std::memcpy(batch.mail.list + used, slot.pending->bytes, slot.size);
+        copies.push_back({(char*)slot.target, (const char*)(batch.mail.target + used), slot.size});
+        used += (slot.size + 15) / 16 * 16;
         if (&slot == l.touch) std::memcpy(&l.touched, slot.pending->bytes, sizeof l.touched);  // n, its first member
         int64_t number = slot.pending->number;
         slot.after = l.launched;
@@ -45,7 +46,7 @@ static bool deliver(GpuLoop& l, StepBatch& batch, int slots) {
         slot.taken.store(number, std::memory_order_release);
     }
     if (left) l.posted.store(1, std::memory_order_relaxed);
-    return !l.error && make_copies(l, batch.mail, count);
+    return !l.error && make_copies(l, batch.mail, copies, used);
 }
 
 // Makes the changes of parameters that wait, in the order of the steps; the balance of the last step has been made.

@@ -4,6 +4,7 @@
 #include <algorithm>
 #include <cstdio>
 #include <cstring>
+#include <vector>
 
 #include "../cpu/native/ring_buffers.h"
 #include "copy_list.cuh"
@@ -14,6 +15,7 @@ typedef uint64_t Address;       // of device memory
 struct CudaDriver {             // functions of the CUDA driver API; each returns 0 or an error
     int32_t (*context_set)(void* context);
     int32_t (*graph_launch)(void* graph, void* stream);
+    int32_t (*to_device)(Address to, const void* from, size_t bytes, void* stream);
     int32_t (*to_host)(void* to, Address from, size_t bytes, void* stream);
     int32_t (*on_device)(Address to, Address from, size_t bytes, void* stream);
     int32_t (*event_record)(void* event, void* stream);
@@ -59,14 +61,13 @@ struct BodyReadback {                    // copies of a body's matrix or positio
 };
 
 struct CopyLaunch {         // copies that the device makes in one launch
-    DeviceCopy* copies;     // page-locked, as is count
-    long long* count;
+    char* list;             // page-locked: CopyList, contents of mail, copies (copy_list.cuh)
+    Address target;         // memory of the device, of the same size, from which it reads them: over the bus each warp would wait
     void* graph;            // of copy_list.cu
 };
 
 struct StepBatch {                     // steps whose results are looked at together
-    char* upload;          // pinned; room for one mail of every slot
-    CopyLaunch mail;       // from there to the slots' targets; room for as many
+    CopyLaunch mail;       // to the slots' targets; room for one mail of every slot
     void* done;            // event
     void* records;         // graph that settles the energy balance of the last step and writes the records that `target` says
     RecordTarget* target;  // pinned
@@ -160,11 +161,15 @@ static bool done(GpuLoop& l, void* event) {
     return !failed(l, answer, "event_query");
 }
 
-// Has the device make the first copies of a list, which it reads later.
-static bool make_copies(GpuLoop& l, const CopyLaunch& list, int64_t count) {
-    if (!count) return true;
-    *list.count = count;
-    CALL(graph_launch, list.graph, l.stream);
+// Has the device make copies, in the order of the steps. used: bytes of the list before them.
+static bool make_copies(GpuLoop& l, const CopyLaunch& launch, const std::vector<DeviceCopy>& copies, int64_t used = sizeof(CopyList)) {
+    if (copies.empty()) return true;
+    const CopyList begin = {(long long)copies.size(), used};
+    const size_t bytes = copies.size() * sizeof(DeviceCopy);
+    std::memcpy(launch.list, &begin, sizeof begin);
+    std::memcpy(launch.list + used, copies.data(), bytes);
+    CALL(to_device, launch.target, launch.list, (size_t)used + bytes, l.stream);
+    CALL(graph_launch, launch.graph, l.stream);
     return true;
 }
 

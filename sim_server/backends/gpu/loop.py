@@ -16,7 +16,7 @@ from sim_server.arrays import Float64, Int64
 from sim_server.backends.base import Due
 from sim_server.backends.gpu import structs
 from sim_server.backends.gpu.mailbox import DeviceMailbox, Mailboxes, library
-from sim_server.backends.gpu.structs import DEVICE_COPY, FRAME_COPIES, RECORD_TARGET
+from sim_server.backends.gpu.structs import COPY_LIST, DEVICE_COPY, FRAME_COPIES, RECORD_TARGET
 from sim_server.backends.measured import Measured
 from sim_server.backends.ring_buffers import Reports
 from sim_server.errors import DeviceLost
@@ -164,24 +164,28 @@ class DeviceLoop(Reports):
             loop.held_reactions, loop.holders = held_reactions.ctypes.data, held_reactions.shape[2]
         self.report_reactions(loop.obstacles + loop.holders, loop.obstacles, poses)
         assert all(size % 4 == 0 for _, size in mailboxes)  # as copy_list.cu copies
-        self._pinned = self._events_and_memory(loop, sum(-(-size // 16) * 16 for _, size in mailboxes))
+        self._pinned = self._events_and_memory(loop)
+        self._pinned += self._lists_of_copies(loop, sum(-(-size // 16) * 16 for _, size in mailboxes))
 
-    def _events_and_memory(self, loop: structs.GpuLoop, upload: int) -> list[NDArray[np.uint8]]:
-        memory = [self._device.pinned(max(upload, 16)) for _ in loop.batches]
+    def _events_and_memory(self, loop: structs.GpuLoop) -> list[NDArray[np.uint8]]:
         targets = [self._device.pinned(RECORD_TARGET.itemsize) for _ in loop.batches]
         self.targets = [target.ctypes.data for target in targets]
-        for batch, upload_memory, target in zip(loop.batches, memory, self.targets, strict=True):
-            batch.upload, batch.target, batch.done = upload_memory.ctypes.data, target, self._device.event()
+        for batch, target in zip(loop.batches, self.targets, strict=True):
+            batch.target, batch.done = target, self._device.event()
         for copy in loop.frame_copies:
             copy.taken, copy.arrived = self._device.event(), self._device.event()
         loop.staged_event, loop.copied_event = self._device.event(), self._device.event()
+        return targets
+
+    def _lists_of_copies(self, loop: structs.GpuLoop, contents: int) -> list[NDArray[np.uint8]]:
+        """Makes room for the lists. contents: bytes of one mail of every slot"""
         self.copy_launches = [*(batch.mail for batch in loop.batches), loop.matrices]
-        rooms = [max(loop.mail_slot_count, 1)] * len(loop.batches) + [loop.bodies]
-        for launch, room in zip(self.copy_launches, rooms, strict=True):
-            memory.append(self._device.pinned(room * DEVICE_COPY.itemsize + 8))
-            launch.copies = memory[-1].ctypes.data
-            launch.count = launch.copies + room * DEVICE_COPY.itemsize
-        return memory + targets
+        mail = contents + loop.mail_slot_count * DEVICE_COPY.itemsize
+        sizes = [mail] * len(loop.batches) + [loop.bodies * DEVICE_COPY.itemsize]
+        lists = [self._device.pinned(COPY_LIST.itemsize + size) for size in sizes]
+        for launch, memory in zip(self.copy_launches, lists, strict=True):
+            launch.list, launch.target = memory.ctypes.data, self._device.memory(len(memory))
+        return lists
 
     def report_grabs(self, graph: int, mailbox: int, reactions: NDArray[Any], counts: NDArray[Any]) -> None:
         """Has records come with what bodies exert on grabs.

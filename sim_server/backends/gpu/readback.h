@@ -10,10 +10,8 @@ static int64_t readback_bytes(const BodyReadback& body) { return body.in_flight 
 // Whether a request is met before a step: a matrix that no step makes by itself is made then. All others are met after a step.
 static bool met_before(const GpuLoop& l, int32_t request) { return l.matrix && request == REQUEST_VALUES; }
 
-// Lists the requests that are met before, or after, a step as copies within the device, in the order of their targets; returns how many.
-static int64_t list_copies(GpuLoop& l, bool before) {
-    DeviceCopy* const copies = l.matrices.copies;
-    int64_t count = 0;
+// Lists the requests that are met before, or after, a step as copies within the device, in the order of their targets.
+static void list_copies(GpuLoop& l, bool before, std::vector<DeviceCopy>& copies) {
     bool others = false;
     for (int i = 0; i < l.bodies; ++i) {
         BodyReadback& body = l.readbacks[i];
@@ -25,22 +23,20 @@ static int64_t list_copies(GpuLoop& l, bool before) {
         }
         body.in_flight = request;
         const Address from = request == REQUEST_VALUES ? l.values + body.values_begin : l.x + body.x_begin;
-        copies[count++] = {(char*)(l.staged + body.staged_begin), (const char*)from, readback_bytes(body)};
+        copies.push_back({(char*)(l.staged + body.staged_begin), (const char*)from, readback_bytes(body)});
     }
     if (others) l.requested.store(1, std::memory_order_release);
-    std::sort(copies, copies + count, [](const DeviceCopy& a, const DeviceCopy& b) { return a.target < b.target; });
-    return count;
+    std::sort(copies.begin(), copies.end(), [](const DeviceCopy& a, const DeviceCopy& b) { return a.target < b.target; });
 }
 
-// Begins to bring to the host what the listed copies have made, those whose places adjoin in one transfer.
-static bool begin_transfers(GpuLoop& l, int64_t count) {
-    const DeviceCopy* const copies = l.matrices.copies;
+// Begins to bring to the host what copies have made, those whose places adjoin in one transfer. copies: in the order of their targets
+static bool begin_transfers(GpuLoop& l, const std::vector<DeviceCopy>& copies) {
     CALL(event_record, l.staged_event, l.stream);
     CALL(stream_wait, l.copy_stream, l.staged_event, 0);
-    for (int64_t k = 0; k < count;) {
+    for (size_t k = 0; k < copies.size();) {
         const Address place = (Address)copies[k].target;
         int64_t bytes = copies[k].bytes;
-        while (++k < count && (Address)copies[k].target == place + bytes) bytes += copies[k].bytes;
+        while (++k < copies.size() && (Address)copies[k].target == place + bytes) bytes += copies[k].bytes;
         CALL(to_host, l.host_matrices + (place - l.staged), place, (size_t)bytes, l.copy_stream);
     }
     CALL(event_record, l.copied_event, l.copy_stream);
@@ -50,10 +46,12 @@ static bool begin_transfers(GpuLoop& l, int64_t count) {
 // Begins the copies that are met before, or after, the step launched next, or last.
 static bool begin_matrices(GpuLoop& l, bool before) {
     if (l.matrix_step >= 0 || (before && !l.matrix) || !l.requested.exchange(0, std::memory_order_acquire)) return true;
-    const int64_t count = list_copies(l, before);
-    if (!count) return true;
+    static thread_local std::vector<DeviceCopy> copies;
+    copies.clear();
+    list_copies(l, before, copies);
+    if (copies.empty()) return true;
     if (before) CALL(graph_launch, l.matrix, l.stream);
-    if (!make_copies(l, l.matrices, count) || !begin_transfers(l, count)) return false;
+    if (!make_copies(l, l.matrices, copies) || !begin_transfers(l, copies)) return false;
     l.matrix_step = before ? l.launched.load() : l.launched - 1;  // steps completed before the matrix was assembled; positions are those after that step
     return true;
 }
