@@ -3,7 +3,6 @@
 
 from collections.abc import Sequence
 from itertools import chain
-from operator import attrgetter
 from typing import NamedTuple
 
 import numpy as np
@@ -19,7 +18,6 @@ from sim_server.network.jobs_in_flight import JobsInFlight
 from sim_server.network.native_copies import native_copies
 
 MOST_TOGETHER = 64  # jobs of a message: as many as a worker on a GPU factorizes together
-BLOCKS, TOPOLOGY, PATTERNS, SHARED = map(attrgetter, ("blocks", "topology", "patterns", "complete"))  # of objects
 
 
 class BatchLayout(NamedTuple):
@@ -37,11 +35,18 @@ class BatchLayout(NamedTuple):
     @classmethod
     def of(cls, known: Sequence[AnnouncedObject], method: str, dtype: str) -> "BatchLayout":
         """Lays out the rooms of factors by a method, of a type. Those of jobs that must go alone have no bytes."""
-        values, patterns = _shared_by(known, method) or _of_each(known, method)
-        item = np.dtype(dtype).itemsize
-        rooms = -(-np.array(values, np.int64) * item // ROOM_ALIGNMENT) * ROOM_ALIGNMENT
-        blocks, topologies = list(map(BLOCKS, known)), list(map(TOPOLOGY, known))
+        rooms = _rooms([most_values(each, method) for each in known], dtype)
+        columns = zip(*((each.blocks, each.topology, each.known_patterns) for each in known), strict=True)
+        blocks, topologies, patterns = map(list, columns)
         return cls(blocks, topologies, patterns, rooms, np.cumsum(rooms) - rooms)
+
+    @classmethod
+    def of_alike(cls, known: AnnouncedObject, count: int, dtype: str) -> "BatchLayout":
+        """Returns that of so many objects of one topology, of whose complete factors the size is known. known: one of
+        them. What patterns an object has alone is not told: its worker sends them again."""
+        rooms = _rooms([most_values(known, COMPLETE)], dtype)
+        blocks, topologies, patterns = [known.blocks] * count, [known.topology] * count, [[*known.complete.patterns]]
+        return cls(blocks, topologies, patterns * count, np.repeat(rooms, count), rooms * np.arange(count))
 
     def part(self, some: slice) -> "BatchLayout":
         """Returns that of a batch of some of the objects."""
@@ -61,19 +66,10 @@ def most_values(known: AnnouncedObject, method: str) -> int:
     return 0 if method == "incomplete_cholesky" else known.most_values(method)
 
 
-def _of_each(known: Sequence[AnnouncedObject], method: str) -> tuple[list[int], list[list[int]]]:
-    """Returns `most_values` and the known patterns of each object."""
-    return [most_values(each, method) for each in known], [each.known_patterns for each in known]
-
-
-def _shared_by(known: Sequence[AnnouncedObject], method: str) -> tuple[list[int], list[list[int]]] | None:
-    """Returns the same where objects are of one topology and have the patterns of it alone; None: they have not."""
-    shared = known[0].complete
-    if method != COMPLETE or not shared.sizes or len(set(map(id, map(SHARED, known)))) > 1:
-        return None
-    if any(own and not own.keys() <= shared.patterns.keys() for own in map(PATTERNS, known)):
-        return None
-    return [max(shared.sizes.values())] * len(known), [list(shared.patterns)] * len(known)
+def _rooms(values: Sequence[int], dtype: str) -> Int64:
+    """Returns the bytes of rooms for so many values of a type."""
+    rooms: Int64 = -(-np.array(values, np.int64) * np.dtype(dtype).itemsize // ROOM_ALIGNMENT) * ROOM_ALIGNMENT
+    return rooms
 
 
 def batch_message(

@@ -36,7 +36,6 @@ BEHIND = 10.0  # s of a lease, at most, for what waits at a worker behind a firs
 LEAST_ON_DEVICE = 1 << 20
 """Bytes of a factor; what has no more crosses the host in less time than the device needs to answer."""
 SHAPE, DTYPE, FLOAT64 = attrgetter("shape"), attrgetter("dtype"), np.dtype(np.float64)  # of matrices
-EPOCH = attrgetter("epoch")  # of objects
 SLOT_MARGIN = 8  # the slot for an incomplete factor is larger than the largest factor so far by a SLOT_MARGIN-th
 
 
@@ -90,13 +89,14 @@ class JobSender:
             return False
         return self._send_alone(self._choice.choose(idle, job.object), job)
 
-    def submit_many(self, jobs: Sequence[Job]) -> list[bool]:
+    def submit_many(self, jobs: Sequence[Job], rooms: dict[str, int]) -> list[bool]:
         """Sends jobs of different objects, the most urgent first, those of small objects to one worker in one message.
+        rooms: as of WorkerChoice
 
         False as of `submit`.
         """
-        rooms = self._choice.rooms() if len(jobs) > 1 else {}
-        able = {name for name in rooms if self._choice.takes_batches(name)}
+        rooms = dict(rooms) if len(jobs) > 1 else {}
+        able = {name for name, room in rooms.items() if room > 1 and self._choice.takes_batches(name)}
         failing = bool(self._book.reliability.failing_objects)
         if isinstance(jobs, JobsTogether) and len(rooms) == len(able) == 1 and not failing:
             (worker,) = able
@@ -137,14 +137,23 @@ class JobSender:
         """Returns the layout of jobs if all of them may share batches, as those of many small bodies do; None: they may
         not."""
         objects, flying = self._book.decoder.objects, self._book.leases.by_object
-        known = [each for each in map(objects.get, jobs.objects) if each is not None]
-        if list(map(EPOCH, known)) != jobs.epochs or len(set(jobs.objects)) < len(jobs):
+        if not flying.keys().isdisjoint(jobs.objects) or len(set(jobs.objects)) < len(jobs):
             return None
-        if not flying.keys().isdisjoint(jobs.objects) or set(map(DTYPE, jobs.values)) != {FLOAT64}:
-            return None
-        told = BatchLayout.of(known, jobs.method.name, jobs.dtype)
-        fit = told.rooms.all() and [(blocks, 3, 3) for blocks in told.blocks] == list(map(SHAPE, jobs.values))
-        return told if fit else None
+        first, method = objects.get(jobs.objects[0]), jobs.method.name
+        if (
+            first is not None
+            and list(map(first.complete.epochs.get, jobs.objects)) == jobs.epochs
+            and method == COMPLETE
+        ):
+            told = BatchLayout.of_alike(first, len(jobs), jobs.dtype)
+        else:
+            known = [each for each in map(objects.get, jobs.objects) if each is not None]
+            if [each.epoch for each in known] != jobs.epochs:
+                return None
+            told = BatchLayout.of(known, method, jobs.dtype)
+        shapes = [(blocks, 3, 3) for blocks in told.blocks]
+        fit = shapes == list(map(SHAPE, jobs.values)) and set(map(DTYPE, jobs.values)) == {FLOAT64}
+        return told if fit and told.rooms.all() else None
 
     def _send_batches(self, worker: str, jobs: JobsTogether, told: BatchLayout) -> list[bool]:
         """Sends jobs to a worker in as few messages as they fit into."""

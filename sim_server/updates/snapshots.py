@@ -76,6 +76,8 @@ class SnapshotPool:
         waiting = np.flatnonzero(self._table.copying)
         steps = self._simulation.engine.matrix_steps(waiting)
         there = np.flatnonzero(steps >= 0)
+        if not len(there):
+            return there, there
         ordered = there[np.argsort(self._table.request[waiting[there]])]
         return waiting[ordered], steps[ordered]
 
