@@ -185,7 +185,7 @@ def test_the_matrix_of_a_body_that_needs_no_factor_is_not_prefetched():
     assert sum(t.job.copy is not None for t in driver.bodies) <= 1
     policy.prefetch.queued = True
     policy.exchange()
-    assert sum(t.job.copy is not None for t in driver.bodies) > 1, "a worker that has many at a time takes them together"
+    assert sum(t.job.copy is not None for t in driver.bodies) > 1, "a worker takes many together"
 
 
 def test_each_copy_of_a_body_alone_is_timed():
