@@ -12,7 +12,7 @@ from sim_server.arrays import Float64
 from sim_server.updates.stats import RunningMean
 
 MAX_DEPTH = 256  # matrices held at once
-SHARE = 8  # of the bodies one in so many at most: more would come sooner, and grow older on their way than that is worth
+SHARE = 8  # of the bodies one in so many at most: more come sooner, and grow older on their way than that is worth
 MAX_WAIT = 2  # steps that a copied matrix may wait for a worker, and those that a copy takes beyond one
 MORE = 1.5  # copies that are begun over those that a worker could make meanwhile by what it reports
 TRANSFER = 1e-3  # s of a job beside the factorization, about
