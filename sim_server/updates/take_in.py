@@ -21,7 +21,7 @@ from sim_server.backends.cpu.factors import NativePattern
 from sim_server.backends.factors_together import FactorsTogether
 from sim_server.updates.checked_body import ARRIVING, WORK, CheckedBody, library, sharing_threads
 
-SHARED = 4 << 20  # bytes from where on threads share the work: a millisecond, of which they take a tenth to start
+SHARED = 1 << 19  # bytes from where on threads share the work: a millisecond, of which they take a tenth to start
 
 
 class SentMatrices(NamedTuple):
