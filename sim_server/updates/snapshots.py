@@ -54,7 +54,7 @@ class SnapshotPool:
             engine.request_matrix(body.index, copy)
         job.set_copy(copy)
 
-    def request_all(self, bodies: Sequence[int], states: Sequence[BodyUpdateState]) -> None:
+    def request_all(self, bodies: Sequence[int] | Int64, states: Sequence[BodyUpdateState]) -> None:
         """Does `request` for some bodies, at once where the loop has memory for their matrices. states: of all"""
         engine, rows = self._simulation.engine, np.asarray(bodies, np.int64)
         whole = self._solver.build != "worker" and self._simulation.splits is None
