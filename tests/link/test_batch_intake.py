@@ -180,6 +180,21 @@ def test_an_error_while_a_message_is_taken_ends_its_jobs(stage, monkeypatch):
     assert stage.counters.refusals == {"unexpected": 1} and len(stage.intake) == 0
 
 
+def test_messages_that_nobody_takes_are_no_more_than_so_many(stage):
+    """Others wait in the ring, which is bounded; once some were taken the thread goes on."""
+    for _ in range(batch_intake.WAITING):
+        stage.send()
+    stage.ring.put(stage.message)
+    time.sleep(0.05)
+    assert stage.intake.done == batch_intake.WAITING and stage.ring.waiting.qsize() == 1
+    assert stage.take() == set(NAMES)
+    end = time.monotonic() + 60
+    while not stage.intake.done:
+        assert time.monotonic() < end
+        time.sleep(1e-3)
+    assert stage.take() == set() and stage.ring.waiting.empty()
+
+
 def test_what_waits_for_the_thread_is_taken_before_a_worker_is_forgotten(stage):
     stage.ring.held = queue.SimpleQueue()
     stage.ring.put(stage.message)
