@@ -73,11 +73,10 @@ class SnapshotPool:
 
     def completed(self) -> tuple[Int64, Int64]:
         """Returns the bodies whose copy is there, in the order of the requests, and the steps of these copies."""
-        waiting = np.flatnonzero(self._table.copying)
+        waiting = self._table.in_order_of_requests()
         steps = self._simulation.engine.matrix_steps(waiting)
-        there = np.flatnonzero(steps >= 0)
-        ordered = there[np.argsort(self._table.request[waiting[there]])]
-        return waiting[ordered], steps[ordered]
+        there = steps >= 0
+        return waiting[there], steps[there]
 
     def suffices(self, state: BodyUpdateState, step: int) -> bool:
         """True if the copy of a step is all that a worker needs. Positions do not tell of the springs of a grab, nor of
