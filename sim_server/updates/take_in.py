@@ -88,7 +88,7 @@ def take_in(
         each["matrix"] = addresses(sent.matrices)
         room, responses = WORK * 3 * int(each["nodes"].max()), sent.responses
     threads = sharing_threads(len(patterns)) if memory.nbytes > SHARED else 1
-    work, hashing = np.empty(abs(threads) * room), hash_address()
+    work, hashing = np.empty(threads * room), hash_address()
     library().wf_take_in(address(each), len(each), hashing, responses or None, address(work), room, threads)
     values = rows(memory, nonzeros.tolist())
     if hashing is None:

@@ -3,7 +3,6 @@
 // this.
 #include <algorithm>
 #include <atomic>
-#include <cstdlib>
 #include <cstring>
 #include <exception>
 #include <thread>
@@ -111,13 +110,11 @@ void share(const Given& given, double* memory, int64_t room, int32_t threads, Wo
         for (size_t k = next++; k < groups.size(); k = next++) work(groups[k].first, groups[k].second, own);
     };
     std::vector<std::thread> others;
-    const bool waits = threads < 0;
-    threads = std::abs(threads);
     try {
         for (int32_t k = 1; k < threads; k++) others.emplace_back(do_next, memory + k * room);
     } catch (const std::exception&) {  // the system gives no more of them, or no memory: those that there are do it
     }
-    if (!waits || others.empty()) do_next(memory);
+    do_next(memory);
     for (std::thread& each : others) each.join();
 }
 
