@@ -97,12 +97,12 @@ class JobSender:
         """
         rooms = dict(rooms) if len(jobs) > 1 else {}
         able = {name for name, room in rooms.items() if room > 1 and self._choice.takes_batches(name)}
-        failing = bool(self._book.reliability.failing_objects)
-        if isinstance(jobs, JobsTogether) and len(rooms) == len(able) == 1 and not failing:
+        failing = self._book.reliability.failing_objects
+        if isinstance(jobs, JobsTogether) and len(rooms) == len(able) == 1 and failing.isdisjoint(jobs.objects):
             (worker,) = able
             if (told := self._layout_of(fitting := jobs[: rooms[worker]])) is not None:
                 return self._send_batches(worker, fitting, told) + [False] * (len(jobs) - len(fitting))
-        return self.submit_sorted(jobs, rooms, able, failing)
+        return self.submit_sorted(jobs, rooms, able, bool(failing))
 
     def submit_sorted(
         self, jobs: Sequence[Job], rooms: dict[str, int], able: set[str], failing: bool
@@ -156,8 +156,10 @@ class JobSender:
         return told if fit and told.rooms.all() else None
 
     def _send_batches(self, worker: str, jobs: JobsTogether, told: BatchLayout) -> list[bool]:
-        """Sends jobs to a worker in as few messages as they fit into."""
-        parts = [slice(k, k + MOST_TOGETHER) for k in range(0, len(jobs), MOST_TOGETHER)]
+        """Sends jobs to a worker in as few messages as they fit into, each of about as many."""
+        messages = -(-len(jobs) // MOST_TOGETHER)
+        each = -(-len(jobs) // messages)
+        parts = [slice(k, k + each) for k in range(0, len(jobs), each)]
         return [sent for part in parts for sent in self._send_batch(worker, jobs[part], told.part(part))]
 
     def _check(self, job: Job) -> AnnouncedObject:

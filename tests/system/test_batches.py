@@ -193,6 +193,30 @@ def test_jobs_by_columns_travel_as_a_list_of_them(stage: Hand, monkeypatch: pyte
     with pytest.raises(ValueError, match="values"):
         dispatch.submit_many(JobsTogether.of([replace(job, values=job.values[1:]) for job in jobs(950)]))
     assert one_by_one == [4, 2, 4, 4] and not dispatch.leases.jobs
+    dispatch.factor_failed("hand", "a")
+    for names, expected in ((("b", "c"), 4), (("a", "b"), 5)):  # only a job of an object that failed is looked at
+        flying = stage.batch(names, form=JobsTogether.of)
+        assert len(one_by_one) == expected
+        stage.send(stage.answer(flying))
+        stage.driver.until(lambda names=names: stage.made() == set(names), "their factors")
+    dispatch.factor_helped("hand", "a")
+
+
+def test_jobs_of_several_messages_are_shared_evenly(stage: Hand, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A small message costs about as much as a large one."""
+    monkeypatch.setattr(job_sender, "MOST_TOGETHER", 3)
+    stage.driver.factors.clear()
+    stage.driver.until(lambda: stage.driver.link.dispatch.ready() >= 4, "room")
+    stage.step = 970
+    assert stage.driver.link.dispatch.submit_many(JobsTogether.of(jobs(970))) == [True] * 4
+    told = []
+    for _ in range(2):
+        batch = MatrixBatch.FromString(bytes(stage.driver.until(stage.received.try_recv, "a batch").attachment))
+        told.append(list(batch.objects))
+        stage.send(stage.answer(batch))
+    stage.driver.until(lambda: stage.made() == set(NAMES), "their factors")
+    stage.check_factors()
+    assert told == [["a", "b"], ["c", "d"]]
 
 
 def test_jobs_for_which_there_is_no_room_are_not_taken(stage: Hand) -> None:
