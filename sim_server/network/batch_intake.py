@@ -65,7 +65,6 @@ class BatchIntake:
         self._working = threading.Lock()  # held while a message is taken in
         self._room = threading.Semaphore(WAITING)  # for messages that are done
         self._ring = session.declare_subscriber(key("factors", server), RingChannel(WAITING))
-        threading.Thread(target=self._serve, name="factors of messages", daemon=True).start()
 
     def __contains__(self, number: int) -> bool:
         """True while the factor of a job is taken in."""
@@ -82,7 +81,8 @@ class BatchIntake:
 
     # ---- in the thread of messages -------------------------------------------------------------------------
 
-    def _serve(self) -> None:
+    def run(self) -> None:
+        """Takes messages in until the session is closed."""
         while self._room.acquire():
             try:
                 sample = self._ring.recv()

@@ -3,6 +3,7 @@
 
 import logging
 import queue
+import threading
 import time
 from collections.abc import Iterator
 from types import SimpleNamespace
@@ -64,6 +65,7 @@ class Stage:
         self.book = Bookkeeping(registry, self.leases, WorkerTiming(), reliability, self.decoder, time.monotonic)
         session: Any = SimpleNamespace(declare_subscriber=lambda *_: self.ring)
         self.intake = BatchIntake(session, "s", self.counters, self.book, Answers(self.counters, self.book))
+        threading.Thread(target=self.intake.run, daemon=True).start()
         self.leases.next_numbers(len(NAMES))
         self.leases.start(self.batch)
 
