@@ -19,7 +19,7 @@ from protocol.messages_pb2 import FactorBatch, MatrixBatch
 from protocol.shared_memory.limits import obstacle
 from protocol.shared_memory.view import SlotMap
 from protocol.validate import checksum
-from sim_server.network import batch_decoder, batch_intake, job_sender, worker_choice
+from sim_server.network import batch_decoder, batch_intake, batch_sender, sending, worker_choice
 from sim_server.network.batch_message import MOST_TOGETHER
 from sim_server.network.job_sender import JobSender
 from sim_server.network.link import ServerLink
@@ -204,7 +204,7 @@ def test_jobs_by_columns_travel_as_a_list_of_them(stage: Hand, monkeypatch: pyte
 
 def test_jobs_of_several_messages_are_shared_evenly(stage: Hand, monkeypatch: pytest.MonkeyPatch) -> None:
     """A small message costs about as much as a large one."""
-    monkeypatch.setattr(job_sender, "MOST_TOGETHER", 3)
+    monkeypatch.setattr(batch_sender, "MOST_TOGETHER", 3)
     stage.driver.factors.clear()
     stage.driver.until(lambda: stage.driver.link.dispatch.ready() >= 4, "room")
     stage.step = 970
@@ -459,8 +459,8 @@ def test_what_waits_behind_a_first_job_has_longer(stage: Hand) -> None:
     stage.driver.submit(new, 1)
     batch = stage.batch()
     leases = {job.object: job.deadline - job.sent_at for job in stage.driver.link.dispatch.leases.jobs}
-    assert {name: round(leases[name]) for name in NAMES} == dict.fromkeys(NAMES, round(job_sender.BEHIND))
-    assert leases["new"] > 2 * job_sender.BEHIND, "but not as long: a message may be lost"
+    assert {name: round(leases[name]) for name in NAMES} == dict.fromkeys(NAMES, round(sending.BEHIND))
+    assert leases["new"] > 2 * sending.BEHIND, "but not as long: a message may be lost"
     answer, values = stage.hand.right_answer(stage.hand.receive(), new)
     stage.hand.answer(answer, values)
     stage.send(stage.answer(batch))
