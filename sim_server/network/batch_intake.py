@@ -243,7 +243,7 @@ class BatchIntake:
             for own, factors in taken:
                 book.leases.finish_all(own, factors.seconds)
         for own, factors in taken:
-            self._answers.count(own[0], sum(values.nbytes for values in factors.values), by_slot, len(own))
+            self._answers.count(own[0], len(own) * factors.values[0].nbytes, by_slot, len(own))  # of one pattern
         for k, refusal in decoded.refused:
             if self._is_current(jobs[k]):
                 self._answers.refuse(jobs[k], refusal, by_slot)
