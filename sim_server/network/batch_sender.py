@@ -72,7 +72,8 @@ class BatchSender:
 
     def send(self, worker: str, jobs: JobsTogether, told: BatchLayout) -> list[bool]:
         """Sends jobs to a worker in as few messages as they fit into, each of about as many."""
-        messages = -(-len(jobs) // MOST_TOGETHER)
+        if (messages := -(-len(jobs) // MOST_TOGETHER)) == 1:
+            return self._send(worker, jobs, told)
         each = -(-len(jobs) // messages)
         parts = [slice(k, k + each) for k in range(0, len(jobs), each)]
         return [sent for part in parts for sent in self._send(worker, jobs[part], told.part(part))]
