@@ -163,12 +163,13 @@ class BatchIntake:
             if isinstance(arrived, Refused):
                 self._counters.refuse(arrived)
                 continue
-            self._book.registry.mark_seen(arrived.message.worker, arrived.at)
-            numbers = {job.number for job in arrived.jobs}
-            others = self._matched(arrived) if arrived.others else []
-            self._beside -= numbers
-            if jobs := [*arrived.jobs, *(job for _, job in others)]:
-                self._answers.guarded(jobs, partial(self._take, arrived, others))
+            try:
+                self._book.registry.mark_seen(arrived.message.worker, arrived.at)
+                others = self._matched(arrived) if arrived.others else []
+                if jobs := [*arrived.jobs, *(job for _, job in others)]:
+                    self._answers.guarded(jobs, partial(self._take, arrived, others))
+            finally:
+                self._beside.difference_update(job.number for job in arrived.jobs)
 
     def _matched(self, arrived: Arrived) -> list[tuple[int, InFlightJob]]:
         """Returns place and job of the other answers that are of a job in flight and the first to it."""

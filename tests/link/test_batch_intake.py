@@ -182,6 +182,16 @@ def test_an_error_while_a_message_is_taken_ends_its_jobs(stage, monkeypatch):
     assert stage.counters.refusals == {"unexpected": 1} and len(stage.intake) == 0
 
 
+def test_jobs_of_a_message_that_fails_as_it_is_taken_are_not_taken_in_any_more(stage, monkeypatch):
+    """Else their leases would never be over, and their objects never have a factor again."""
+    monkeypatch.setattr(BatchIntake, "_matched", lambda *_: {}["nose"])
+    stage.message.jobs[2] = 1 << 40
+    stage.send()
+    with pytest.raises(KeyError):
+        stage.take()
+    assert len(stage.intake) == 0 and stage.leases.count("w") == len(NAMES)
+
+
 def test_messages_that_nobody_takes_are_no_more_than_so_many(stage):
     """Others wait in the ring, which is bounded; once some were taken the thread goes on."""
     for _ in range(batch_intake.WAITING):
