@@ -9,6 +9,9 @@ from numpy.typing import NDArray
 
 from protocol.shared_memory.located import Located, addresses
 from sim_server.backends.gpu.device_values import DeviceValues
+from sim_server.backends.gpu.structs import BUILD
+
+WHERE = BUILD.enumeration("ValuesAre")  # values of a build may be
 
 
 class PinnedArray(Located):
@@ -38,9 +41,16 @@ def is_pinned(array: NDArray[Any] | DeviceValues) -> bool:
     return isinstance(array, DeviceValues) or (isinstance(array, PinnedArray) and array.flags.c_contiguous)
 
 
-def all_pinned(arrays: Sequence[NDArray[Any] | DeviceValues], dtype: np.dtype[Any]) -> bool:
-    """True if the device can read each of some arrays by itself, all of one type."""
-    return all(each.dtype == dtype and is_pinned(each) for each in arrays)
+def readable(
+    arrays: Sequence[NDArray[Any] | DeviceValues], dtype: np.dtype[Any]
+) -> tuple[Sequence[NDArray[Any] | DeviceValues], int]:
+    """Returns arrays of a type as they are if the device can read all of them by itself, else in usual memory; and
+    where they are (ValuesAre of launch_build.h)."""
+    if all(each.dtype == dtype and is_pinned(each) for each in arrays):
+        on_device = sum(isinstance(each, DeviceValues) for each in arrays)
+        if on_device in (0, len(arrays)):
+            return arrays, WHERE["ON_DEVICE"] if on_device else WHERE["PAGE_LOCKED"]
+    return [np.ascontiguousarray(np.asarray(each), dtype) for each in arrays], WHERE["PAGEABLE"]
 
 
 def runs(arrays: Sequence[NDArray[Any] | DeviceValues]) -> list[tuple[int, int, int]]:
