@@ -16,7 +16,7 @@ import numpy as np
 import xxhash
 from numpy.typing import NDArray
 
-from protocol.shared_memory.located import address
+from protocol.shared_memory.located import address, addresses
 from protocol.validate import ALONE, checksum, copied, helping_threads
 
 SOURCE = Path(__file__).with_name("copies.cpp")
@@ -75,21 +75,17 @@ class Copies:
             arguments: list[Any] = [c.c_int64, p, p, p, i, p, p, i]
             self._library.copy_all.restype, self._library.copy_all.argtypes = None, arguments
 
-    def copy(
-        self, sources: Sequence[NDArray[Any]], targets: Sequence[NDArray[Any]], own_sources: bool = False
-    ) -> list[int]:  # fmt: skip
-        """Copies each source to its target, of the same number of bytes. Returns the `checksum` of each target.
-
-        own_sources: other processes may write to the targets, so that of the sources is told; else these may be
-        written to meanwhile
-        """
+    def gather(self, sources: Sequence[NDArray[Any]], target: NDArray[np.uint8]) -> list[int]:
+        """Copies arrays one behind the other to the begin of a target. Returns the `checksum` of each copy. Raises
+        ValueError if there is no room for them."""
+        if not all(each.flags.c_contiguous for each in sources):
+            sources = [np.ascontiguousarray(each) for each in sources]
+        size = np.array([each.nbytes for each in sources], np.int64)
+        parts = Parts(target, np.cumsum(size) - size)
         if self._library is None:
-            pairs = [(s, t.view(s.dtype)) for s, t in zip(sources, targets, strict=True)]
-            return [copied(s, t, s if own_sources else t)[0] for s, t in pairs]
-        size = _sizes(sources)
-        if any(s.nbytes != t.nbytes or not t.flags.c_contiguous for s, t in zip(sources, targets, strict=True)):
-            raise ValueError("a target is not contiguous, or not of the bytes of its source")
-        return self._call(_addresses(sources), _addresses(targets), size, own_sources)
+            pairs = zip([each.reshape(-1).view(np.uint8) for each in sources], parts.split(size), strict=True)
+            return [copied(source, part, part)[0] for source, part in pairs]
+        return self._call(addresses(sources), parts.addresses(size), size, False)
 
     def copy_parts(
         self, source: Parts, target: Parts, size: NDArray[np.int64], own_sources: bool = False
@@ -97,7 +93,8 @@ class Copies:
         """Copies parts of an array to parts of another one, of `size` bytes each (k,); returns the `checksum` of each.
         Raises ValueError if a part lies outside of its array.
 
-        own_sources: as of `copy`
+        own_sources: other processes may write to the targets, so that of the sources is told; else these may be
+        written to meanwhile
         """
         begin, to = source.addresses(size), target.addresses(size)
         if self._library is None:
@@ -123,14 +120,3 @@ class Copies:
             hash_address(), sums.ctypes.data, threads,
         )  # fmt: skip
         return list(sums.tolist())
-
-
-def _sizes(arrays: Sequence[NDArray[Any]]) -> NDArray[np.int64]:
-    """Returns the bytes of each array, each contiguous. Raises ValueError."""
-    if not all(each.flags.c_contiguous for each in arrays):
-        raise ValueError("arrays are not all contiguous")
-    return np.array([each.nbytes for each in arrays], np.int64)
-
-
-def _addresses(arrays: Sequence[NDArray[Any]]) -> NDArray[np.uintp]:
-    return np.array([address(each) for each in arrays], np.uintp)

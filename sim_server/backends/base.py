@@ -361,7 +361,7 @@ class Engine(Protocol):
         `request_matrix` it saves a copy. The matrix behind that one leaves it alone. None: there is none such."""
         ...
 
-    def request_matrices(self, bodies: Sequence[int]) -> list[Float64] | None:
+    def request_matrices(self, bodies: Int64) -> list[Float64] | None:
         """Does `request_matrix` for the `copy_memory` of each of some bodies, and returns that memory; None, and does
         nothing: there is none."""
         ...
@@ -378,12 +378,16 @@ class Engine(Protocol):
         """Returns the number of steps completed before the copy requested last was made; -1: it is not there yet."""
         ...
 
-    def matrix_steps(self, bodies: Sequence[int]) -> Int64:
+    def matrix_steps(self, bodies: Int64) -> Int64:
         """Returns `matrix_step` of each of some bodies."""
         ...
 
     def staged_matrix(self, body: int) -> int:
         """Returns where the device has the matrix that was copied last; 0: nowhere, or with other numbers."""
+        ...
+
+    def staged_matrices(self, bodies: Int64) -> Int64:
+        """Returns `staged_matrix` of each of some bodies."""
         ...
 
     def replace(self, launch: int, new: Launch) -> PendingUpdate:

@@ -134,7 +134,7 @@ def capture(simulation: Simulation, driver: Driver, software: str) -> Checkpoint
             arrays[f"factor/{name}/values"] = factor.values
         if not driver.policy.free and state.job.matrix is not None:
             step, values = state.job.matrix
-            method = state.factors.method(step)
+            method = driver.method(state.body.index, step)
             if simulation.epoch(name, step) == simulation.epoch(name, engine.step):  # another one has another pattern
                 entry.job = JobEntry(step=step, method=method.name if method else "")
                 blocks = simulation.system.body_values(state.body.first, state.body.last)

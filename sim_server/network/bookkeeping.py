@@ -6,7 +6,8 @@ from dataclasses import dataclass, field
 
 from protocol.messages_pb2 import Topology
 from sim_server.network.factor_decoder import FactorDecoder
-from sim_server.network.leases import InFlightJob, Leases
+from sim_server.network.jobs_in_flight import InFlightJob
+from sim_server.network.leases import Leases
 from sim_server.network.worker_registry import WorkerRegistry
 from sim_server.network.worker_reliability import WorkerReliability
 from sim_server.network.worker_timing import WorkerTiming

@@ -7,7 +7,8 @@ factor_intake.py; all of them share what is known of workers and jobs (bookkeepi
 
 import logging
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from typing import Any
 
 import zenoh
@@ -26,7 +27,8 @@ from sim_server.network.factor_decoder import FactorDecoder
 from sim_server.network.factor_intake import FactorIntake
 from sim_server.network.inbox import Inbox
 from sim_server.network.job_sender import JobSender
-from sim_server.network.leases import InFlightJob, Leases
+from sim_server.network.jobs_in_flight import InFlightJob
+from sim_server.network.leases import Leases
 from sim_server.network.native_copies import compile_ahead
 from sim_server.network.send_queue import SendQueue
 from sim_server.network.worker_choice import WorkerChoice
@@ -81,6 +83,7 @@ class Dispatch(FactorSource):
         self._inbox = Inbox(session, server)
         self._token_query_due = 0.0
         self._looked_at = -LOOK_PERIOD  # at which leases were looked through
+        self._received = False  # within a round whose messages were taken in
         self._on_message: dict[str, Callable[[zenoh.Sample], None]] = {
             "worker": self._on_heartbeat,
             "pattern": self._on_pattern,
@@ -143,6 +146,17 @@ class Dispatch(FactorSource):
         """Number of tokens of workers that have sent no heartbeat. A probe for tests."""
         with self._lock:
             return self._registry.unclaimed_tokens
+
+    @contextmanager
+    def round(self) -> Iterator[None]:
+        """Takes in all messages that arrived at the begin of a round of calls, and no more within it."""
+        with self._lock:
+            self._receive()
+            self._received = True
+        try:
+            yield
+        finally:
+            self._received = False
 
     def ready(self) -> int:
         """Number of jobs that workers can take now: one of each idle worker, more where all objects are small."""
@@ -258,7 +272,9 @@ class Dispatch(FactorSource):
     # ---- messages from workers -------------------------------------------------------------------------------
 
     def _receive(self) -> None:
-        """Takes in all messages that arrived, refuses malformed ones, and ends leases."""
+        """Takes in all messages that arrived, refuses malformed ones, and ends leases. Once in a `round`."""
+        if self._received:
+            return
         for channel, sample in self._inbox:
             try:
                 self._on_message[channel](sample)
@@ -274,7 +290,6 @@ class Dispatch(FactorSource):
         self._query_tokens()
         if self._clock() >= self._looked_at + LOOK_PERIOD:  # many jobs are submitted one after another
             self._looked_at = self._clock()
-            self._sender.forget_sent()
             self._end_leases()
 
     def _end_leases(self) -> None:
@@ -282,12 +297,12 @@ class Dispatch(FactorSource):
         for job in self.leases.expire(self._clock(), self._intake.is_decoded):
             self._counters.add("leases_over")
             self._on_expired(job, "was not answered within its lease")
-        for job in self.leases.expire_undelivered(self._sent_at, self._registry.idle_period):
+        for job in self.leases.expire_undelivered(self._put_at, self._registry.idle_period):
             self._counters.add("jobs_lost")
             self._on_expired(job, f"was lost: worker {job.worker} says that it has no job")
 
-    def _sent_at(self, job: InFlightJob) -> float:
-        return float("inf") if self._intake.is_decoded(job) else self._sender.sent_at(job)
+    def _put_at(self, job: InFlightJob) -> float:
+        return float("inf") if self._intake.is_decoded(job) else job.put_at
 
     def _on_expired(self, job: InFlightJob, why: str) -> None:
         self._sender.forget_link(job.worker)  # zenoh may have dropped the job

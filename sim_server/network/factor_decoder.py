@@ -32,7 +32,7 @@ from protocol.validate import (
 )
 from sim_server.arrays import Float32, Float64
 from sim_server.backends.shared_memory import SharedMemory
-from sim_server.network.leases import InFlightJob
+from sim_server.network.jobs_in_flight import InFlightJob
 from sim_server.scene.size_limits import expected_values
 from sim_server.updates.factor_source import FactorMemory
 

@@ -22,7 +22,8 @@ from protocol.shared_memory.pool import Slot
 from protocol.validate import check_header, parse, take
 from sim_server.arrays import Float32, Float64
 from sim_server.network.arriving_factor import ArrivingFactor
-from sim_server.network.leases import MIN_BANDWIDTH, InFlightJob
+from sim_server.network.jobs_in_flight import InFlightJob
+from sim_server.network.lease_terms import MIN_BANDWIDTH
 
 AHEAD = 2  # parts asked for at a time: one is copied while the next is under way
 ANSWERS = 4  # to a question that wait to be read; forged ones stand in the way of nobody else

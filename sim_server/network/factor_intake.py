@@ -19,7 +19,7 @@ from sim_server.backends.factors_together import FactorsTogether
 from sim_server.network.batch_decoder import DecodedFactors, decode_several
 from sim_server.network.bookkeeping import Bookkeeping
 from sim_server.network.factor_fetch import AHEAD, FactorFetch
-from sim_server.network.leases import InFlightJob
+from sim_server.network.jobs_in_flight import InFlightJob
 from sim_server.updates.take_in import BeginCheck
 
 T = TypeVar("T")

@@ -11,7 +11,7 @@ from protocol.shared_memory.pool import Slot
 from protocol.validate import checksum, copied
 from sim_server.arrays import Float64
 from sim_server.network.factor_decoder import AnnouncedObject
-from sim_server.network.leases import InFlightJob
+from sim_server.network.jobs_in_flight import InFlightJob
 
 
 def matrix_message(job: InFlightJob, known: AnnouncedObject, incarnation: int, lease: float, method: Method) -> Matrix:

@@ -3,9 +3,10 @@
 
 import time
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, partial
+from operator import attrgetter
 
 import numpy as np
 import zenoh
@@ -19,21 +20,22 @@ from protocol.shared_memory.limits import SLOT_SHARE
 from protocol.shared_memory.pool import Slot, SlotPool
 from sim_server.arrays import Float64
 from sim_server.backends.shared_memory import PlacedMatrix
-from sim_server.network.batch_message import MOST_TOGETHER, Entry, batch_message, entries_of, fill, group
+from sim_server.network.batch_message import MOST_TOGETHER, BatchLayout, batch_message, fill, most_values
 from sim_server.network.bookkeeping import Bookkeeping
 from sim_server.network.device_slots import DeviceSlot, DeviceSlots
 from sim_server.network.factor_decoder import AnnouncedObject
 from sim_server.network.job_message import add_values, matrix_message
-from sim_server.network.leases import InFlightJob
+from sim_server.network.jobs_in_flight import JobsInFlight
 from sim_server.network.send_queue import SendQueue
 from sim_server.network.worker_choice import WorkerChoice
 from sim_server.updates.factor_source import Job
+from sim_server.updates.jobs_together import JobsTogether
 
 FAST_SEND = 0.05  # s in which a fast link takes a job as bytes; zenoh drops what is not taken within 0.25 s
 BEHIND = 10.0  # s of a lease, at most, for what waits at a worker behind a first job, which has a longer one
 LEAST_ON_DEVICE = 1 << 20
 """Bytes of a factor; what has no more crosses the host in less time than the device needs to answer."""
-MAX_SENT = 4096  # times of jobs that are remembered
+SHAPE, DTYPE, FLOAT64 = attrgetter("shape"), attrgetter("dtype"), np.dtype(np.float64)  # of matrices
 SLOT_MARGIN = 8  # the slot for an incomplete factor is larger than the largest factor so far by a SLOT_MARGIN-th
 
 
@@ -61,25 +63,12 @@ class JobSender:
         self._session, self._server, self._incarnation = session, server, incarnation
         self._pool, self._queue, self._counters = pool, queue, counters
         self._book, self._choice = book, choice
-        self._sent: dict[int, float] = {}  # when the network took a job, by its number
         self._filling: deque[Filling] = deque()  # oldest first
         self._fast_links: set[str] = set()  # workers without shared memory whose link takes a job at once
-
-    def sent_at(self, job: InFlightJob) -> float:
-        """Time at which the network took a job [s, monotonic]; inf: it has not yet."""
-        return self._sent.get(job.number, float("inf"))
 
     def forget_link(self, worker: str) -> None:
         """Takes the link to a worker for slow until it shows that it is fast."""
         self._fast_links.discard(worker)
-
-    def forget_sent(self) -> None:
-        """Forgets when jobs were sent that are over, once they are many."""
-        if len(self._sent) > MAX_SENT:
-            flying = {job.number for job in self._book.leases.jobs}
-            for number in list(self._sent):  # a copy: the thread of the queue adds to it meanwhile
-                if number not in flying:
-                    del self._sent[number]
 
     def give_back_sent(self) -> None:
         """Gives back slots that the thread of the queue needs no more: they are free once their jobs are over, too."""
@@ -105,24 +94,26 @@ class JobSender:
 
         False as of `submit`.
         """
-        taken = [False] * len(jobs)
-        batches: dict[tuple[str, tuple[str, Method]], list[int]] = {}  # places of jobs by worker and what they share
         rooms = self._choice.rooms() if len(jobs) > 1 else {}
         able = {name for name in rooms if self._choice.takes_batches(name)}
-        idle = [name for name, room in rooms.items() if room > 0]
         failing = bool(self._book.reliability.failing_objects)
-        simple = len(idle) == 1 and idle[0] in able and not failing and len(jobs) <= rooms[idle[0]]
-        if simple and (alike := self.alike(jobs)) is not None:
-            return self._send_batches(idle[0], alike)
-        sized: list[tuple[Job, AnnouncedObject, int]] = []  # by place
-        last: tuple[str, str, Method] | None = None  # worker, dtype and method of the job before, by identity
-        sizes: dict[tuple[int, str], int] = {}
+        if isinstance(jobs, JobsTogether) and len(rooms) == len(able) == 1 and not failing:
+            (worker,) = able
+            if (known := self._known_of(fitting := jobs[: rooms[worker]])) is not None:
+                return self._send_batches(worker, fitting, known) + [False] * (len(jobs) - len(fitting))
+        return self.submit_sorted(jobs, rooms, able, failing)
+
+    def submit_sorted(
+        self, jobs: Sequence[Job], rooms: dict[str, int], able: set[str], failing: bool
+    ) -> list[bool]:  # fmt: skip
+        """Sends jobs, a worker chosen for each. rooms, able: of workers with room, and those that take batches"""
+        taken = [False] * len(jobs)
+        batches: dict[tuple[str, tuple[str, Method]], list[int]] = {}  # places of jobs by worker and what they share
+        idle, known = [name for name, room in rooms.items() if room > 0], [self._check(job) for job in jobs]
         for place, job in enumerate(jobs):
-            known = self._check(job)
             worker = self._worker_for(job, idle, rooms, failing) if idle else None
-            values = self._batched_values(job, known, sizes) if worker in able else 0
-            sized.append((job, known, values))
-            if worker is None or not values:
+            together = worker in able and not job.positions and most_values([known[place]], job.method.name)[0] > 0
+            if worker is None or not together:
                 taken[place] = self.submit(job)
                 rooms = self._choice.rooms()
                 for (name, _), places in batches.items():
@@ -132,37 +123,30 @@ class JobSender:
             rooms[worker] -= 1
             if not rooms[worker]:
                 idle.remove(worker)
-            if last is None or last[0] != worker or last[1] != job.dtype or last[2] is not job.method:
-                last, own = (worker, job.dtype, job.method), batches.setdefault((worker, group(job)), [])
-            own.append(place)
+            batches.setdefault((worker, (job.dtype, job.method)), []).append(place)
         for (worker, _), places in batches.items():
-            sent = self._send_batches(worker, [sized[place] for place in places])
+            sent = self._send_batches(worker, JobsTogether.of([jobs[k] for k in places]), [known[k] for k in places])
             for place, well in zip(places, sent, strict=True):
                 taken[place] = well
         return taken
 
-    def alike(self, jobs: Sequence[Job]) -> list[tuple[Job, AnnouncedObject, int]] | None:
-        """Returns what is known of the objects of jobs, and how many values their factors have, if all of them may
-        share batches, as those of many small bodies do, for which it takes less time than what `submit_many` does else.
-        None: they may not."""
-        objects, flying, first = self._book.decoder.objects, self._book.leases.by_object, jobs[0]
-        dtype, method, sizes = first.dtype, first.method, dict[tuple[int, str], int]()
-        found: list[tuple[Job, AnnouncedObject, int]] = []
-        for job in jobs:
-            known = objects.get(job.object)
-            same = job.dtype == dtype and (job.method is method or job.method == method)
-            if known is None or not same or known.epoch != job.epoch or job.object in flying:
-                return None
-            values, matrix = self._batched_values(job, known, sizes), job.values
-            if not values or matrix.shape != (known.blocks, 3, 3) or matrix.dtype != np.float64:
-                return None
-            found.append((job, known, values))
-        return found if len({job.object for job in jobs}) == len(jobs) else None
+    def _known_of(self, jobs: JobsTogether) -> list[AnnouncedObject] | None:
+        """Returns what is known of the objects of jobs if all of them may share batches, as those of many small bodies
+        do; None: they may not."""
+        objects, flying = self._book.decoder.objects, self._book.leases.by_object
+        known = [each for each in map(objects.get, jobs.objects) if each is not None]
+        if [each.epoch for each in known] != jobs.epochs or len(set(jobs.objects)) < len(jobs):
+            return None
+        if not flying.keys().isdisjoint(jobs.objects) or 0 in most_values(known, jobs.method.name):
+            return None
+        if [(each.blocks, 3, 3) for each in known] != list(map(SHAPE, jobs.values)):
+            return None
+        return known if set(map(DTYPE, jobs.values)) == {FLOAT64} else None
 
-    def _send_batches(self, worker: str, sized: Sequence[tuple[Job, AnnouncedObject, int]]) -> list[bool]:
+    def _send_batches(self, worker: str, jobs: JobsTogether, known: Sequence[AnnouncedObject]) -> list[bool]:
         sent: list[bool] = []
-        for k in range(0, len(sized), MOST_TOGETHER):
-            sent += self._send_batch(worker, sized[k : k + MOST_TOGETHER])
+        for k in range(0, len(jobs), MOST_TOGETHER):
+            sent += self._send_batch(worker, jobs[k : k + MOST_TOGETHER], known[k : k + MOST_TOGETHER])
         return sent
 
     def _check(self, job: Job) -> AnnouncedObject:
@@ -185,68 +169,50 @@ class JobSender:
             able = self._choice.candidates(able, job.object)
         return self._choice.choose(able, job.object, rooms) if able else None
 
-    def _batched_values(self, job: Job, known: AnnouncedObject, sizes: dict[tuple[int, str], int]) -> int:
-        """Returns for how many values of its factor there is room in a batch; 0 for a job that must go alone, as the
-        size of its factor is not known: that of an incomplete one may grow. sizes: of what objects of a topology share,
-        as far as it is known"""
-        method = job.method.name
-        if job.values.ndim != 3 or method == "incomplete_cholesky":
-            return 0
-        if method != COMPLETE or not known.complete.sizes:
-            return known.most_values(method)
-        key = id(known.complete), method
-        if (values := sizes.get(key)) is None:
-            values = sizes[key] = known.most_values(method)
-        return values
-
     # ---- a batch ---------------------------------------------------------------------------------------------
 
-    def _send_batch(self, worker: str, sized: Sequence[tuple[Job, AnnouncedObject, int]]) -> list[bool]:
-        """Sends jobs to a worker in one message, or one by one if there are no slots for them together. sized: as of
-        `entries_of`"""
-        slots, leases, jobs = None, self._book.leases, [job for job, _, _ in sized]
+    def _send_batch(self, worker: str, jobs: JobsTogether, known: Sequence[AnnouncedObject]) -> list[bool]:
+        """Sends jobs to a worker in one message, or one by one if there are no slots for them together."""
+        slots, leases = None, self._book.leases
         if len(jobs) > 1:
-            entries = entries_of(sized)
-            slots = self._allocate_batch(entries)
+            told = BatchLayout.of(known, jobs.method.name, jobs.dtype)
+            slots = self._allocate_batch(jobs, told)
         if slots is None:
             return [self._send_alone(worker, job) for job in jobs]
-        objects = [(job.object, known.blocks) for job, known, _ in sized]
-        seconds, exclusive = leases.terms(objects, worker, jobs[0].method.name)
-        rooms = [(entry.first, entry.room) for entry in entries]
-        in_flight = self._begin(jobs, worker, seconds, slots, slots[1], rooms, exclusive=exclusive)
-        message = batch_message(entries, in_flight, seconds, self._incarnation, *slots)
-        filling, matrices = Filling(slots), [job.values for job in jobs]
-        if self._queue.post(partial(self._fill_and_put, message, matrices, in_flight, filling)):
+        seconds, periods = leases.terms.of_all(jobs.objects, told.blocks, worker, jobs.method.name)
+        batch = self._begin(worker, jobs, seconds, periods)
+        batch.first, batch.rooms, batch.matrices, batch.bodies = told.first, told.rooms, jobs.values, jobs.bodies
+        batch.slots, batch.factor_slot, batch.factor_generation = slots, slots[1], slots[1].generation
+        leases.start(batch)
+        message = partial(batch_message, batch, told, seconds.tolist(), jobs.method, self._incarnation, *slots)
+        if self._queue.post(partial(self._fill_and_put, message, batch, filling := Filling(slots))):
             self._filling.append(filling)
-            self._on_sent(worker, jobs)
+            self._on_sent(batch, 72 * sum(told.blocks))
             return [True] * len(jobs)
-        for job in in_flight:
-            leases.cancel(job)
+        leases.cancel(batch.jobs)
         self._give_back(slots)
         return [False] * len(jobs)
 
-    def _fill_and_put(
-        self, message: MatrixBatch, matrices: Sequence[Float64], jobs: Sequence[InFlightJob], filling: Filling
-    ) -> None:  # fmt: skip
-        """Copies matrices and sends them, in the thread of the queue. The slots are not lent again meanwhile."""
-        slot, name = filling.slots[0], key("matrices", self._server, worker=message.worker)
+    def _fill_and_put(self, message: Callable[[], MatrixBatch], batch: JobsInFlight, filling: Filling) -> None:
+        """Makes the message of a batch, copies its matrices and sends them, in the thread of the queue. The slots are
+        not lent again meanwhile."""
+        slot, name = filling.slots[0], key("matrices", self._server, worker=batch.worker)
         try:
-            fill(message, matrices, slot)
-            self._put(jobs, name, slot.payload, message.SerializeToString(), True)
+            fill(made := message(), batch.matrices, slot)
+            self._put(batch, name, slot.payload, made.SerializeToString(), True)
         finally:
             filling.over = True
 
-    def _allocate_batch(self, entries: Sequence[Entry]) -> tuple[Slot, Slot] | None:
+    def _allocate_batch(self, jobs: JobsTogether, told: BatchLayout) -> tuple[Slot, Slot] | None:
         """Allocates a slot for matrices and one for factors; None if there is not enough shared memory."""
         assert self._pool is not None
-        users = len(entries) + 1  # and the thread that sends them
-        matrices = self._pool.lend(sum(entry.job.values.nbytes for entry in entries), users)
-        factors = self._pool.lend(entries[-1].first + entries[-1].room, users)
+        users = len(jobs) + 1  # and the thread that sends them
+        matrices = self._pool.lend(72 * sum(told.blocks), users)
+        factors = self._pool.lend(told.bytes, users)
         if matrices is not None and factors is not None:
             return matrices, factors
         for slot in filter(None, (matrices, factors)):
-            for _ in range(users):
-                self._pool.give_back(slot)
+            self._pool.give_back(slot, users)
         return None
 
     # ---- a job alone -----------------------------------------------------------------------------------------
@@ -256,17 +222,18 @@ class JobSender:
             return self._send_on_device(worker, job, *on_device)
         matrix_slot, factor_slot = self._allocate(worker, job)
         known = self._book.decoder.objects[job.object]
-        lease = self._book.leases.lease(job.object, worker, job.method.name, job.positions, known.blocks)
-        slots = tuple(slot for slot in (matrix_slot, factor_slot) if slot is not None)
-        payload_bytes = 0 if matrix_slot else job.values.nbytes
-        (in_flight,) = self._begin([job], worker, [lease], slots, factor_slot, [(0, 0)], payload_bytes)
-        message = matrix_message(in_flight, known, self._incarnation, lease, job.method)
+        batch, lease = self._begin_alone(worker, job, known)
+        batch.slots = tuple(slot for slot in (matrix_slot, factor_slot) if slot is not None)
+        batch.factor_slot, batch.factor_generation = factor_slot, factor_slot.generation if factor_slot else 0
+        batch.payload_bytes = 0 if matrix_slot else job.values.nbytes
+        self._book.leases.start(batch)
+        message = matrix_message(batch.jobs[0], known, self._incarnation, lease, job.method)
         payload = add_values(message, job.values, matrix_slot)
         name, attachment = key("matrix", self._server, worker=worker, object=job.object), message.SerializeToString()
-        if self._queue.post(lambda: self._put([in_flight], name, payload, attachment, matrix_slot is not None)):
-            self._on_sent(worker, [job])
+        if self._queue.post(lambda: self._put(batch, name, payload, attachment, matrix_slot is not None)):
+            self._on_sent(batch, job.values.nbytes)
             return True
-        self._book.leases.cancel(in_flight)
+        self._book.leases.cancel(batch.jobs)
         return False
 
     def _lend_on_device(self, worker: str, job: Job) -> list[DeviceSlot] | None:
@@ -280,25 +247,26 @@ class JobSender:
 
     def _send_on_device(self, worker: str, job: Job, matrix: DeviceSlot, factor: DeviceSlot) -> bool:
         known, leases = self._book.decoder.objects[job.object], self._book.leases
-        lease = leases.lease(job.object, worker, job.method.name, blocks=known.blocks)
-        (in_flight,) = self._begin([job], worker, [lease], (matrix, factor), None, [(0, 0)], device_slot=factor)
-        message = matrix_message(in_flight, known, self._incarnation, lease, job.method)
+        batch, lease = self._begin_alone(worker, job, known)
+        batch.slots, batch.device_slot, batch.device_generation = (matrix, factor), factor, factor.generation
+        leases.start(batch)
+        message = matrix_message(batch.jobs[0], known, self._incarnation, lease, job.method)
         message.device_matrix.CopyFrom(matrix.message())
-        if self._queue.post(partial(self._put_on_device, in_flight, job, message, matrix)):
-            self._on_sent(worker, [job])
+        if self._queue.post(partial(self._put_on_device, batch, job, message, matrix)):
+            self._on_sent(batch, job.values.nbytes)
             return True
-        leases.cancel(in_flight)
+        leases.cancel(batch.jobs)
         return False
 
-    def _put_on_device(self, in_flight: InFlightJob, job: Job, message: Matrix, matrix: DeviceSlot) -> None:
+    def _put_on_device(self, batch: JobsInFlight, job: Job, message: Matrix, matrix: DeviceSlot) -> None:
         """Copies a matrix within the device and sends its job, in the thread of the queue."""
-        device, factor = self.device, in_flight.device_slot
+        device, factor = self.device, batch.device_slot
         assert device is not None and factor is not None
         for slot, told in ((matrix, message.device_matrix), (factor, message.device_factor)):
             device.mark(slot, told.generation)
         device.memory.put(matrix.address, [PlacedMatrix(job.values, job.on_device)])
-        name = key("matrix", self._server, worker=in_flight.worker, object=in_flight.object)
-        self._put([in_flight], name, zenoh.ZBytes(b""), message.SerializeToString(), True)
+        name = key("matrix", self._server, worker=batch.worker, object=job.object)
+        self._put(batch, name, zenoh.ZBytes(b""), message.SerializeToString(), True)
 
     def _allocate(self, worker: str, job: Job) -> tuple[Slot | None, Slot | None]:
         """Allocates slots for the matrix and its factor; None for an array that must travel as bytes, as the first
@@ -334,43 +302,36 @@ class JobSender:
 
     # ---- both ------------------------------------------------------------------------------------------------
 
-    def _begin(
-        self, jobs: Sequence[Job], worker: str, seconds: Sequence[float], slots: tuple[Slot | DeviceSlot, ...],
-        factor_slot: Slot | None, rooms: Sequence[tuple[int, int]], payload_bytes: int = 0,
-        device_slot: DeviceSlot | None = None, exclusive: Sequence[float] = (),
-    ) -> list[InFlightJob]:  # fmt: skip
-        """Begins the leases of jobs that are being sent together.
+    def _begin_alone(self, worker: str, job: Job, known: AnnouncedObject) -> tuple[JobsInFlight, float]:
+        """Makes the batch of a job alone, with the time [s] that its worker has."""
+        terms = self._book.leases.terms
+        lease = terms.lease(job.object, worker, job.method.name, job.positions, known.blocks)
+        period = terms.exclusive_period(job.object, known.blocks)
+        batch = self._begin(worker, JobsTogether.of([job]), np.array([lease]), np.array([period]))
+        batch.positions, batch.part_bytes = job.positions, PART_BYTES
+        return batch, lease
 
-        seconds: that the worker has for each. rooms: first byte and bytes of each in the slot of the factors
-        exclusive: their exclusive periods [s]; none: to be asked for
+    def _begin(self, worker: str, jobs: JobsTogether, seconds: Float64, periods: Float64) -> JobsInFlight:
+        """Makes the batch of jobs that are being sent together, still without slots.
+
+        seconds: that the worker has for each, longer behind jobs that have longer. periods: exclusive ones [s]
         """
-        now, leases, objects = self._book.clock(), self._book.leases, self._book.decoder.objects
-        latest, generation = leases.deadlines().get(worker, 0.0), factor_slot.generation if factor_slot else 0
-        begun: list[InFlightJob] = []
-        device_generation = device_slot.generation if device_slot else 0
-        periods = exclusive or [leases.exclusive_period(job.object, objects[job.object].blocks) for job in jobs]
-        for job, lease, (first, room), period in zip(jobs, seconds, rooms, periods, strict=True):
-            deadline = now + max(lease, min(latest - now, BEHIND))
-            latest = max(latest, deadline)
-            begun.append(
-                InFlightJob(
-                    leases.next_number(), job.object, job.epoch, job.step, job.warp, _dtype_name(job.dtype), worker,
-                    deadline, factor_slot, generation, slots, first, room, now, now + period, job.method.name,
-                    payload_bytes, job.values.ndim == 2, PART_BYTES, device_slot, device_generation,
-                )
-            )  # fmt: skip
-        leases.start_all(begun)
-        return begun
+        now, leases = self._book.clock(), self._book.leases
+        behind = np.maximum(leases.deadlines().get(worker, 0.0) - now, np.maximum.accumulate(seconds))
+        deadlines = now + np.maximum(seconds, np.minimum(behind, BEHIND))
+        return JobsInFlight(
+            worker, _dtype_name(jobs.dtype), jobs.method.name, leases.next_numbers(len(jobs)), jobs.objects,
+            jobs.epochs, jobs.steps, jobs.warps, deadlines, now + periods, now,
+        )  # fmt: skip
 
-    def _on_sent(self, worker: str, jobs: Sequence[Job]) -> None:
-        self._book.last_worker.update((job.object, worker) for job in jobs)
-        self._book.reliability.on_sent(worker, self._book.clock())
-        self._counters.add("jobs", len(jobs))
-        self._counters.add("bytes_out", sum(job.values.nbytes for job in jobs))
+    def _on_sent(self, batch: JobsInFlight, size: int) -> None:
+        """Takes note of a batch whose matrices have so many bytes."""
+        self._book.last_worker.update(dict.fromkeys(batch.objects, batch.worker))
+        self._book.reliability.on_sent(batch.worker, self._book.clock())
+        self._counters.add("jobs", len(batch))
+        self._counters.add("bytes_out", size)
 
-    def _put(
-        self, jobs: Sequence[InFlightJob], name: str, payload: zenoh.ZBytes, attachment: bytes, shared: bool
-    ) -> None:  # fmt: skip
+    def _put(self, batch: JobsInFlight, name: str, payload: zenoh.ZBytes, attachment: bytes, shared: bool) -> None:
         """Sends a job or a batch of them, in the thread of the send queue. If a link is full, zenoh drops it or blocks.
 
         A dropped job ends its lease. zenoh blocks only for bytes over a link that is not known to be fast, since a
@@ -378,7 +339,7 @@ class JobSender:
         for a receiver that subscribed to everything and stopped reading. The priority is one of its own, since a
         blocked message locks the queue of its priority.
         """
-        worker = jobs[0].worker
+        worker = batch.worker
         drop = shared or worker in self._fast_links
         control = zenoh.CongestionControl.DROP if drop else zenoh.CongestionControl.BLOCK
         begin = time.perf_counter()
@@ -387,9 +348,7 @@ class JobSender:
         )
         if not drop and time.perf_counter() - begin < FAST_SEND:
             self._fast_links.add(worker)
-        now = self._book.clock()
-        for job in jobs:
-            self._sent[job.number] = now
+        batch.put_at = self._book.clock()
 
 
 @cache

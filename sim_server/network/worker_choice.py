@@ -5,7 +5,8 @@ from collections.abc import Callable, Mapping
 
 from sim_server.network.batch_message import MOST_TOGETHER
 from sim_server.network.bookkeeping import Bookkeeping
-from sim_server.network.leases import MAX_EXPIRED, InFlightJob
+from sim_server.network.jobs_in_flight import InFlightJob
+from sim_server.network.leases import MAX_EXPIRED
 
 SMALL_BLOCKS = 20_000  # of the largest matrix, if several jobs may wait at a worker
 MOST_ALONE = 32  # jobs in flight at a worker while they go alone, each with slots of its own, which are slow to make

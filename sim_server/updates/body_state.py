@@ -7,10 +7,10 @@ from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from protocol.factor import Factor
 from protocol.method import Method
+from sim_server.arrays import Float64, Int64
 from sim_server.backends.rosenbrock import FORMS
 from sim_server.mechanics.world import Body
 from sim_server.updates.autotune.preconditioner import PreconditionerTuner
@@ -80,23 +80,28 @@ class JobState:
     """
 
     in_flight, checked, excess_sent = Cell(), Cell(), Cell()
+    request, requested, extrapolated, positions = Cell(), Cell(), Cell(), Cell()
 
     def __init__(self, table: UpdateTable, index: int):
         self._table, self._index = table, index
-        self.copy: NDArray[np.float64] | None = None
-        self.request, self.requested, self.extrapolated = 0, 0.0, 0.0
-        self.matrix: tuple[int, NDArray[np.float64]] | None = None
-        self.positions = False
 
-    def set_copy(self, copy: NDArray[np.float64] | None) -> None:
+    @property
+    def copy(self) -> Float64 | None:
+        return self._table.copies[self._index]
+
+    def set_copy(self, copy: Float64 | None) -> None:
         """Takes note of the memory that the loop is asked to copy into; None: the copy is given up."""
-        self.copy, self._table.copying[self._index] = copy, copy is not None
+        self._table.copies[self._index], self._table.copying[self._index] = copy, copy is not None
 
-    def on_sent(self, step: int) -> None:
-        """Takes note that the copy was sent, but for what stands in the table."""
-        copy, self.copy = self.copy, None
-        self.matrix = None if copy is None else (step, copy)
-        self.positions = copy is not None and copy.ndim == 2
+    @property
+    def matrix(self) -> tuple[int, Float64] | None:
+        held = self._table.matrices[self._index]
+        return None if held is None else (self._table.matrix_steps.item(self._index), held)
+
+    @matrix.setter
+    def matrix(self, matrix: tuple[int, Float64] | None) -> None:
+        step, held = (NONE, None) if matrix is None else matrix
+        self._table.matrix_steps[self._index], self._table.matrices[self._index] = step, held
 
     @property
     def sent(self) -> int | None:
@@ -219,13 +224,12 @@ class BodyUpdateState:
 
     def on_job(self, step: int, method: Method) -> None:
         """Takes note that the matrix of a step is to be factorized."""
-        _remember(self.factors.methods, step, method)
         if self.tuner is not None:
+            _remember(self.factors.methods, step, method)
             self.tuner.factorization.on_sent()
 
     def on_sent(self, step: int) -> None:
         """Takes note that the copy of `step` was sent. It is kept until its factor came, which is checked with it."""
-        self.job.on_sent(step)
         on_sent(self._table, [self._index], [step])
 
     def on_factor(self, factor: Factor, step: int) -> bool:
@@ -300,18 +304,27 @@ class BodyUpdateState:
             self.solves.max_factor_age = max(self.solves.max_factor_age, int(record["step"]) - 1 - factor_step)
 
 
-def on_requests(states: Sequence[BodyUpdateState], copies: Sequence[NDArray[np.float64]]) -> None:
-    """Takes note of the memory that the loop is asked to copy the matrices of different bodies of one table into."""
-    for state, copy in zip(states, copies, strict=True):
-        state.job.copy = copy
-    states[0]._table.copying[[state._index for state in states]] = True
+def on_requests(table: UpdateTable, rows: Int64, copies: Sequence[Float64], first: int, now: float) -> None:
+    """Takes note of the memory that the loop is asked to copy the matrices of different bodies into. first: number of
+    the first request, in their order. now: [s, monotonic]"""
+    for row, copy in zip(rows.tolist(), copies, strict=True):
+        table.copies[row] = copy
+    table.copying[rows] = True
+    table.request[rows], table.requested[rows] = np.arange(first, first + len(rows)), now
+    table.extrapolated[rows] = 0.0
 
 
-def on_sent(table: UpdateTable, rows: Sequence[int], steps: Sequence[int]) -> None:
-    """Takes note of copies that were sent, of some steps, in what the table has of them."""
-    row = np.asarray(rows, np.int64)
-    table.in_flight[row], table.copying[row], table.sent[row] = True, False, steps
-    table.excess_sent[row], table.excess[row] = table.excess[row], 0.0
+def on_sent(table: UpdateTable, bodies: Sequence[int] | Int64, steps: Sequence[int] | Int64) -> None:
+    """Takes note of copies that were sent, of some steps. They are kept until their factors came."""
+    rows, copies = np.asarray(bodies, np.int64), table.copies
+    sent = [copies[row] for row in rows.tolist()]
+    for row, copy in zip(rows.tolist(), sent, strict=True):
+        table.matrices[row], copies[row] = copy, None
+    table.positions[rows] = [copy is not None and copy.ndim == 2 for copy in sent]
+    table.sent[rows] = steps
+    table.matrix_steps[rows] = np.where([copy is None for copy in sent], NONE, table.sent[rows])
+    table.in_flight[rows], table.copying[rows] = True, False
+    table.excess_sent[rows], table.excess[rows] = table.excess[rows], 0.0
 
 
 def on_checks(table: UpdateTable, rows: Sequence[int], steps: Sequence[int]) -> None:

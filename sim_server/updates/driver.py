@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from protocol.counters import Counters
 from protocol.factor import Factor
 from protocol.method import Method
-from sim_server.arrays import Float64
+from sim_server.arrays import Float64, Int64
 from sim_server.backends.base import Capability
 from sim_server.backends.cpu.structs import REACTION
 from sim_server.backends.factors_together import FactorsTogether
@@ -29,6 +29,7 @@ from sim_server.simulation import Simulation
 from sim_server.updates.body_state import BodyUpdateState, MadeFactors, on_checks, on_factors
 from sim_server.updates.factor_check import FactorCheck
 from sim_server.updates.factor_source import FactorSource, Inline, Job
+from sim_server.updates.jobs_together import JobsTogether
 from sim_server.updates.many_factors import MANY, ManyFactors
 from sim_server.updates.patterns import Patterns
 from sim_server.updates.policies import make_policy
@@ -101,7 +102,7 @@ class Driver:
         self.on_adopt: list[Callable[[Factor], Any]] = []  # called with every factor that the loop is given
         self.on_epoch: list[Callable[[Body, int], None]] = []  # called before the first job of an epoch of a body
         self._many = ManyFactors(self)
-        self.snapshots = SnapshotPool(simulation, self.source, self.policy.expected_latency)
+        self.snapshots = SnapshotPool(simulation, self.source, table, self.policy.expected_latency)
         if self.wants_factors and self.policy.free:
             self.source.check_with(self._many.begin_check)
         self.useless_factors = UselessFactors(self)
@@ -109,7 +110,10 @@ class Driver:
         self._behind: list[Factor] = []  # that wait for the end of the check of the factor before them
         self._begin_checks()
         self._observer = SolveObserver(self)
-        self._warped = {b.name: b.index in simulation.warped for b in world.bodies}
+        self._names = [b.name for b in world.bodies]
+        self._warped = [b.index in simulation.warped for b in world.bodies]
+        self._alike = not self.tuned and simulation.splits is None and self.solver.build != "worker"
+        """All jobs are of the first epoch, by one method, of matrices."""
 
     # --- steps --------------------------------------------------------------------------------------------------
 
@@ -190,6 +194,21 @@ class Driver:
         self.snapshots.discard(state)
         return None
 
+    def make_jobs(self, bodies: Int64, steps: Int64) -> Sequence[Job]:
+        """Returns the jobs of the copies of some steps that the loop has made for bodies. Those that do not suffice are
+        discarded."""
+        if not self._alike:
+            made = [
+                self.make_job(self.bodies[k], step) for k, step in zip(bodies.tolist(), steps.tolist(), strict=True)
+            ]
+            return [job for job in made if job is not None]
+        rows, copies = bodies.tolist(), self.table.copies
+        return JobsTogether(
+            bodies, [self._names[row] for row in rows], [1] * len(rows), steps.tolist(),
+            [self._warped[row] for row in rows], [cast(Float64, copies[row]) for row in rows], self._dtype,
+            self._method, self.engine.staged_matrices(bodies).tolist(),
+        )  # fmt: skip
+
     def _is_present(self, state: BodyUpdateState, step: int) -> bool:
         """False if the copy is of a matrix from before the body was split for the last time, or after it."""
         s, body = self.simulation, state.body
@@ -215,7 +234,7 @@ class Driver:
                     begin(state.body, epoch)
         method = self._method if state.tuner is None else state.tuner.factorization.method
         state.on_job(step, method)
-        return Job(name, epoch, step, self._warped[name], values, self._dtype, method, on_device)
+        return Job(name, epoch, step, self._warped[state.body.index], values, self._dtype, method, on_device)
 
     # --- factors in ---------------------------------------------------------------------------------------------
 
@@ -391,7 +410,7 @@ class Driver:
         if not self.policy.free:
             state.factors.kept = replace(factor, values=factor.values.copy())
         # Tell observers how it was made
-        method = state.factors.method(factor.step)
+        method = self.method(state.body.index, factor.step)
         if self.on_adopt:
             at_end = Capability.MATRIX_POSITIONS not in self.engine.capabilities
             later = state.job.positions and at_end and factor.worker != self.inline.WORKER
@@ -441,8 +460,8 @@ class Driver:
         settings.kind, settings.probe = state.tuner.kind, state.tuner.probe
 
     def method(self, body: int, step: int) -> Method | None:
-        """Returns how the factor of a step was made."""
-        return self.bodies[body].factors.method(step)
+        """Returns how the factor of a step was made; None if that is not remembered."""
+        return self.bodies[body].factors.method(step) if self.tuned else self._method
 
     def age_bound(self) -> int:
         """Returns the age [steps] that no factor exceeds while all goes well, by what was measured; -1: not known."""

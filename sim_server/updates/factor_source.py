@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -57,6 +58,10 @@ class FactorSource(Protocol):
     A source derives from this class and defines the four abstract methods. The others have bodies for a source that
     is one worker in this process; a pool of workers replaces them.
     """
+
+    def round(self) -> AbstractContextManager[None]:
+        """Takes in what has arrived at the begin of a round of calls, and nothing more within it."""
+        return nullcontext()
 
     @abstractmethod
     def ready(self) -> int:

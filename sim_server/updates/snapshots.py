@@ -7,14 +7,14 @@ which is checked with it; then its memory is used again, so that in the long run
 
 import time
 from collections.abc import Callable, Sequence
-from itertools import count
 
 import numpy as np
-from numpy.typing import NDArray
 
+from sim_server.arrays import Float64, Int64
 from sim_server.simulation import Simulation
 from sim_server.updates.body_state import BodyUpdateState, on_requests
 from sim_server.updates.factor_source import FactorSource
+from sim_server.updates.update_table import NONE, UpdateTable
 
 MAX_FAILED_ASSEMBLIES = 3  # jobs in a row with positions without a factor, after which matrices are sent for good
 
@@ -27,21 +27,20 @@ class SnapshotPool:
     """
 
     def __init__(
-        self, simulation: Simulation, source: FactorSource, expected_latency: Callable[[BodyUpdateState], float]
-    ):
+        self, simulation: Simulation, source: FactorSource, table: UpdateTable,
+        expected_latency: Callable[[BodyUpdateState], float],
+    ):  # fmt: skip
         self._simulation, self._source, self._expected_latency = simulation, source, expected_latency
-        self._solver = simulation.scene.solver
-        self._requests = count()
-        self._requested: dict[int, BodyUpdateState] = {}  # by body, oldest first; what was sent leaves it later
+        self._solver, self._table = simulation.scene.solver, table
+        self._requests = 0  # so far
         self._shapes: dict[int, tuple[int, int, int]] = {}  # of the matrices of bodies, with room for all blocks
-        self.free: dict[tuple[int, ...], list[NDArray[np.float64]]] = {}  # by shape; pages touched before
+        self.free: dict[tuple[int, ...], list[Float64]] = {}  # by shape; pages touched before
 
     def request(self, state: BodyUpdateState) -> None:
         """Asks the loop to copy when it assembles next: the matrix, or the positions if they suffice."""
         engine, body, job = self._simulation.engine, state.body, state.job
-        job.request, job.requested = next(self._requests), time.monotonic()
-        self._requested.pop(body.index, None)  # to stand behind all others
-        self._requested[body.index] = state
+        job.request, job.requested = self._requests, time.monotonic()
+        self._requests += 1
         if self._workers_assemble(state):
             copy = self._allocate((body.last - body.first, 3))
             job.extrapolated = self._extrapolated_time(state)
@@ -55,38 +54,30 @@ class SnapshotPool:
             engine.request_matrix(body.index, copy)
         job.set_copy(copy)
 
-    def request_all(self, states: Sequence[BodyUpdateState]) -> None:
-        """Does `request` for some bodies, at once where the loop has memory for their matrices."""
-        engine = self._simulation.engine
+    def request_all(self, bodies: Sequence[int], states: Sequence[BodyUpdateState]) -> None:
+        """Does `request` for some bodies, at once where the loop has memory for their matrices. states: of all"""
+        engine, rows = self._simulation.engine, np.asarray(bodies, np.int64)
         whole = self._solver.build != "worker" and self._simulation.splits is None
-        copies = engine.request_matrices([state.body.index for state in states]) if states and whole else None
+        copies = engine.request_matrices(rows) if len(rows) and whole else None
         if copies is None:
-            for state in states:
-                self.request(state)
+            for row in rows.tolist():
+                self.request(states[row])
             return
-        now, number = time.monotonic(), self._requests
-        for state in states:
-            state.job.request, state.job.requested, state.job.extrapolated = next(number), now, 0.0
-            self._requested.pop(state.body.index, None)
-            self._requested[state.body.index] = state
-        on_requests(states, copies)
+        on_requests(self._table, rows, copies, self._requests, time.monotonic())
+        self._requests += len(rows)
 
     def step(self, state: BodyUpdateState) -> int:
         """Returns the steps completed before the one whose matrix was copied; -1: the copy is not there yet."""
         step: int = self._simulation.engine.matrix_step(state.body.index)
         return step
 
-    def completed(self) -> list[tuple[BodyUpdateState, int]]:
+    def completed(self) -> tuple[Int64, Int64]:
         """Returns the bodies whose copy is there, in the order of the requests, and the steps of these copies."""
-        steps = self._simulation.engine.matrix_steps(list(self._requested))
-        places = np.flatnonzero(steps >= 0)
-        if not len(places):
-            return []
-        states = list(self._requested.values())
-        there = [(states[k], step) for k, step in zip(places.tolist(), steps[places].tolist(), strict=True)]
-        for state in [state for state, _ in there if state.job.copy is None]:  # sent, or given up
-            del self._requested[state.body.index]
-        return [each for each in there if each[0].job.copy is not None]
+        waiting = np.flatnonzero(self._table.copying)
+        steps = self._simulation.engine.matrix_steps(waiting)
+        there = np.flatnonzero(steps >= 0)
+        ordered = there[np.argsort(self._table.request[waiting[there]])]
+        return waiting[ordered], steps[ordered]
 
     def suffices(self, state: BodyUpdateState, step: int) -> bool:
         """True if the copy of a step is all that a worker needs. Positions do not tell of the springs of a grab, nor of
@@ -104,7 +95,7 @@ class SnapshotPool:
         self.recycle(state.job.copy)
         state.job.set_copy(None)
 
-    def release(self, state: BodyUpdateState, step: int = -1) -> NDArray[np.float64] | None:
+    def release(self, state: BodyUpdateState, step: int = -1) -> Float64 | None:
         """Recycles the copy of the job in flight, which is over. Returns it if it is the matrix of `step`: to be read
         before the next request."""
         if state.job.matrix is None:
@@ -113,9 +104,16 @@ class SnapshotPool:
         self.recycle(values)
         return values if copied == step and values.ndim == 3 else None
 
-    def hold(
-        self, state: BodyUpdateState, step: int
-    ) -> tuple[NDArray[np.float64] | None, NDArray[np.float64] | None]:  # fmt: skip
+    def release_all(self, bodies: Int64) -> None:
+        """Does `release` for some bodies, whose copies nobody reads any more."""
+        held, matrices = self._table.matrices, [self._table.matrices[body] for body in bodies.tolist()]
+        for body, matrix in zip(bodies.tolist(), matrices, strict=True):
+            if matrix is not None:
+                self.recycle(matrix)
+                held[body] = None
+        self._table.matrix_steps[bodies] = NONE
+
+    def hold(self, state: BodyUpdateState, step: int) -> tuple[Float64 | None, Float64 | None]:
         """Returns the copy of the job in flight, which is over, and the same if it is the matrix of `step`. Its memory
         is not used again before `recycle`."""
         if state.job.matrix is None:
@@ -123,11 +121,11 @@ class SnapshotPool:
         (copied, values), state.job.matrix = state.job.matrix, None
         return values, values if copied == step and values.ndim == 3 else None
 
-    def _allocate(self, shape: tuple[int, ...]) -> NDArray[np.float64]:
+    def _allocate(self, shape: tuple[int, ...]) -> Float64:
         free = self.free.setdefault(shape, [])
         return free.pop() if free else np.full(shape, 0.0)
 
-    def recycle(self, copy: NDArray[np.float64]) -> None:
+    def recycle(self, copy: Float64) -> None:
         """Has the memory of a copy used again."""
         if copy.base is None:  # not a view of the system's own values
             self.free.setdefault(copy.shape, []).append(copy)

@@ -112,7 +112,9 @@ class UpdateTable:
     excess, latest, lost, factor_step, max_factor_age, iteration_cost, first_excess: as in SolveStatistics
     refused, failures: as `refused`, `in_a_row` in FailureState
     newest, latency, cost, used: as in FactorStatistics; dropped: the newest factor is useless
-    sent, in_flight, checked, excess_sent: as in JobState; copying: a copy is requested, or waits to be sent
+    sent, in_flight, checked, excess_sent, request, requested, extrapolated, positions: as in JobState
+    copying: a copy is requested, or waits to be sent
+    copies, matrices: as in JobState, lists; matrix_steps: of these matrices
     frozen, error_bound: as in BodyUpdateState
     """
 
@@ -128,7 +130,10 @@ class UpdateTable:
 
         self.excess, self.latest, self.lost, self.excess_sent = zeros(), zeros(), zeros(), zeros()
         self.factor_step, self.max_factor_age, self.newest, self.sent = steps(), steps(), steps(), steps()
-        self.checked = steps()
+        self.checked, self.matrix_steps, self.request = steps(), steps(), steps()
+        self.requested, self.extrapolated, self.positions = zeros(), zeros(), np.zeros(bodies, np.bool_)
+        self.copies: list[Float64 | None] = [None] * bodies
+        self.matrices: list[Float64 | None] = [None] * bodies
         self.iteration_cost, self.latency, self.cost = unknown(), unknown(), unknown()
         self.first_excess = unknown()
         self.refused, self.failures, self.used = (np.zeros(bodies, np.int64) for _ in range(3))

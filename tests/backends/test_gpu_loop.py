@@ -738,20 +738,20 @@ def test_a_matrix_in_the_memory_of_the_loop_is_not_copied_once_more():
     assert all(scene.loop.copy_memory(k) is memory and memory.shape == (2, 3, 3) for k, memory in enumerate(own))
     scene.loop.request_matrix(0, own[0])
     scene.loop.request_matrix(2, own[2])
-    assert scene.loop.matrix_steps([0, 1, 2]).tolist() == [-1, -1, -1]
+    assert scene.loop.matrix_steps(np.array([0, 1, 2])).tolist() == [-1, -1, -1]
     scene.loop.run(40)
-    assert scene.loop.matrix_steps([2, 1, 0]).tolist() == [20, -1, 20]
+    assert scene.loop.matrix_steps(np.array([2, 1, 0])).tolist() == [20, -1, 20]
     assert (own[0] == 20).all() and (own[2] == 20).all() and not own[1].any()
     next_one = scene.loop.copy_memory(0)
     scene.loop.request_matrix(0, next_one)
     scene.loop.request_matrix(1, own[1])
     scene.loop.run(40)
-    assert scene.loop.matrix_steps([0, 1, 2]).tolist() == [60, 60, 20]
+    assert scene.loop.matrix_steps(np.array([0, 1, 2])).tolist() == [60, 60, 20]
     assert (own[0] == 20).all() and (next_one == 60).all() and (own[1] == 60).all() and (own[2] == 20).all()
     scene.loop.request_matrix(1, target)
     scene.loop.request_matrix(0, scene.loop.copy_memory(0))
     scene.loop.run(40)
-    assert scene.loop.matrix_steps([0, 1, 2]).tolist() == [100, 100, 20]
+    assert scene.loop.matrix_steps(np.array([0, 1, 2])).tolist() == [100, 100, 20]
     assert (own[0] == 100).all() and (next_one == 60).all() and (own[1] == 60).all() and (target == 100).all()
 
 
@@ -759,16 +759,16 @@ def test_matrices_of_several_bodies_are_requested_at_once_as_one_by_one():
     scene = FakeScene(bodies=3)
     scene.loop.run(20)
     first = [scene.loop.copy_memory(k) for k in range(3)]
-    asked = scene.loop.request_matrices([2, 0])
+    asked = scene.loop.request_matrices(np.array([2, 0]))
     assert asked[0] is first[2] and asked[1] is first[0]
-    assert scene.loop.matrix_steps([0, 1, 2]).tolist() == [-1, -1, -1]
+    assert scene.loop.matrix_steps(np.array([0, 1, 2])).tolist() == [-1, -1, -1]
     scene.loop.run(40)
-    assert scene.loop.matrix_steps([0, 1, 2]).tolist() == [20, -1, 20]
+    assert scene.loop.matrix_steps(np.array([0, 1, 2])).tolist() == [20, -1, 20]
     assert (first[0] == 20).all() and (first[2] == 20).all() and not first[1].any()
-    again = scene.loop.request_matrices([0, 1])
+    again = scene.loop.request_matrices(np.array([0, 1]))
     assert again[0] is not first[0] and again[1] is first[1]
     scene.loop.run(40)
-    assert scene.loop.matrix_steps([0, 1, 2]).tolist() == [60, 60, 20]
+    assert scene.loop.matrix_steps(np.array([0, 1, 2])).tolist() == [60, 60, 20]
     assert (first[0] == 20).all() and (again[0] == 60).all() and (again[1] == 60).all()
     scene.loop.request_matrix(0, third := scene.loop.copy_memory(0))
     scene.loop.run(40)
@@ -780,7 +780,7 @@ def test_matrices_of_another_type_or_large_ones_have_no_memory_of_the_loop(monke
     if real == "f8":
         monkeypatch.setattr(loop_module, "DOUBLED", 100)
     scene, target = FakeScene(bodies=2, real=real), np.zeros((2, 3, 3))
-    assert scene.loop.copy_memory(1) is None and scene.loop.request_matrices([0, 1]) is None
+    assert scene.loop.copy_memory(1) is None and scene.loop.request_matrices(np.array([0, 1])) is None
     for step in (0, 40):
         scene.loop.request_matrix(1, target)
         scene.loop.run(40)

@@ -12,7 +12,7 @@ from protocol.push_limits import LONGEST_PUSH
 from protocol.shared_memory import limits
 from sim_server import cli
 from sim_server.mesh import MOST_TETS, skin
-from sim_server.network import command_queue, factor_fetch, leases, rate_limiter, worker_registry
+from sim_server.network import command_queue, factor_fetch, lease_terms, rate_limiter, worker_registry
 from sim_server.recording import recorder
 from sim_server.scene import integrator_options, where
 from sim_server.service import commands, supervisor
@@ -54,10 +54,10 @@ def test_channels() -> None:
         ("protocol.md", f"while fewer than {command_queue.MAX_DEFERRED} wait"),
         ("protocol.md", f"Of workers {worker_registry.WORKERS} are known at a time"),
         ("protocol.md", f"of names that have a token and say nothing {worker_registry.TOKENS};"),
-        ("protocol.md", f"{leases.LEASE_FACTOR} times what the last factorization of that object took"),
-        ("protocol.md", f"({leases.MIN_LEASE:g} s at least)"),
-        ("protocol.md", f"has {leases.MAX_LEASE:g} s."),
-        ("protocol.md", f"({leases.MIN_LEASE:g} to {leases.MAX_LEASE:g} s,"),
+        ("protocol.md", f"{lease_terms.LEASE_FACTOR} times what the last factorization of that object took"),
+        ("protocol.md", f"({lease_terms.MIN_LEASE:g} s at least)"),
+        ("protocol.md", f"has {lease_terms.MAX_LEASE:g} s."),
+        ("protocol.md", f"({lease_terms.MIN_LEASE:g} to {lease_terms.MAX_LEASE:g} s,"),
         ("protocol.md", f"no new jobs after {worker_registry.SILENCE:g} s;"),
         ("protocol.md", f"at most {LONGEST_PUSH:g} s of simulation"),
         ("protocol.md", f"`ulimit -l` of {(limits.POOL_LIMIT + limits.METADATA) >> 10:,} KiB"),
@@ -88,7 +88,7 @@ def test_channels() -> None:
         ("protocol.md", f"asked for three times, {factor_fetch.QUESTION_TIME:g} s each"),
         ("protocol.md", f"no part has come for {factor_fetch.STALL:g} s"),
         ("protocol.md", f"The most is {MOST_VALUES:,} values"),
-        ("protocol.md", f"above {leases.LEASE_BLOCKS:,} of them"),
+        ("protocol.md", f"above {lease_terms.LEASE_BLOCKS:,} of them"),
         ("scenes.md", f"is at most {integrator_options.MAX_STATES}"),
     ],
 )

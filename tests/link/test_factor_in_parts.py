@@ -21,7 +21,7 @@ from protocol.refused import Refused
 from sim_server.network import arriving_factor, factor_fetch
 from sim_server.network.arriving_factor import ArrivingFactor
 from sim_server.network.factor_fetch import ATTEMPTS, FactorFetch
-from sim_server.network.leases import InFlightJob
+from tests.support.in_flight import in_flight
 
 INCARNATION, JOB = 7, 3
 COUNTERS = Counters(logging.getLogger("test"))
@@ -137,7 +137,7 @@ class ScriptedSession:
 
 
 def fetch_of(session: Any, count: int, part_bytes: int, parts: list[int]) -> FactorFetch:
-    job = InFlightJob(JOB, "beam", 1, 1, True, "float32", "w", 0.0, part_bytes=part_bytes)
+    job = in_flight(JOB, "beam", 1, 1, "float32", "w", 0.0, part_bytes=part_bytes)
     return FactorFetch(session, "sim", INCARNATION, COUNTERS, job, count, parts, ())
 
 

@@ -16,7 +16,7 @@ from protocol.refused import Refused
 from protocol.validate import checksum
 from sim_server.network import batch_decoder as module
 from sim_server.network.factor_decoder import FactorDecoder
-from sim_server.network.leases import InFlightJob
+from tests.support.in_flight import in_flight
 from tests.worker.block_matrices import bar_edges, pattern, spd
 
 GRAPHS = [pattern(12, bar_edges(1, 1, 2)), pattern(8, bar_edges(1, 1, 1))]
@@ -56,9 +56,9 @@ def stage() -> SimpleNamespace:
         decoder.add_pattern(key("pattern", worker="w", object=name), made.pattern.message(header).SerializeToString())
         values[name] = made.factorize(spd(*GRAPHS[kind], seed=place), np.float32)
         slot.part(place * ROOM, np.float32, len(values[name]))[:] = values[name]
-        job = InFlightJob(
-            place + 1, name, 1, 5, True, "float32", "w", 9.0, factor_slot=slot, factor_generation=3,  # type: ignore[arg-type]
-            first=place * ROOM, room=ROOM,
+        job = in_flight(
+            place + 1, name, 1, 5, "float32", "w", 9.0, factor_slot=slot, factor_generation=3,
+            first=np.array([place * ROOM]), rooms=np.array([ROOM]),
         )  # fmt: skip
         answers.append((place, job))
         message.jobs.append(job.number)
@@ -137,10 +137,10 @@ def test_a_value_that_no_factor_has_costs_the_others_nothing(stage, number, kind
 
 
 def test_one_that_has_no_room_of_its_own_is_refused_alone(stage):
-    stage.answers[1][1].room = 64
+    stage.answers[1][1].batch.rooms[0] = 64
     assert refused(stage) == {"b": "slot"}
-    stage.answers[3][1].factor_generation = 4
-    stage.answers[4][1].factor_slot = None
+    stage.answers[3][1].batch.factor_generation = 4
+    stage.answers[4][1].batch.factor_slot = None
     assert refused(stage) == {"b": "slot", "d": "slot", "e": "slot"}
 
 

@@ -14,9 +14,9 @@ from protocol.refused import Refused
 from protocol.validate import checksum
 from sim_server.network import factor_decoder as module
 from sim_server.network.factor_decoder import FactorDecoder
-from sim_server.network.leases import InFlightJob
 from sim_server.scene.size_limits import expected_values
 from tests.scenes import simulation
+from tests.support.in_flight import in_flight
 
 CELLS = {"long": (1, 1, 60), "small": (4, 4, 4), "flat": (20, 20, 1), "cube": (10, 10, 10)}
 
@@ -112,7 +112,7 @@ def test_one_whose_factor_is_rejected_sets_no_slot_from_then_on(stage) -> None:
             header=header, step=5, warp=True, dtype="float32", pattern=pattern.id, nonzeros=pattern.nonzeros,
             worker="w", job=1, checksum=checksum(values),
         )  # fmt: skip
-        decoder.decode(message, values.tobytes(), InFlightJob(1, "body", 2, 5, True, "float32", "w", 9.0))
+        decoder.decode(message, values.tobytes(), in_flight(1, "body", 2, 5, "float32", "w", 9.0))
 
     def most() -> list[int]:
         return [decoder.objects[name].most_values("cholesky") for name in names]

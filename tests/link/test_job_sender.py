@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""When jobs were sent: noted by the thread that sends them, forgotten by the one that asks for it."""
+"""When jobs were sent, noted by the thread that sends them; what is made ready for the first one."""
 
 import logging
 from collections.abc import Callable
@@ -13,7 +13,6 @@ from protocol.channels import PART_BYTES, PROTOCOL
 from protocol.counters import Counters
 from protocol.messages_pb2 import Header, Topology
 from protocol.shared_memory.limits import POOL_LIMIT, SLOT_SHARE
-from sim_server.network import job_sender
 from sim_server.network.bookkeeping import Bookkeeping
 from sim_server.network.factor_decoder import FactorDecoder
 from sim_server.network.job_sender import JobSender
@@ -26,28 +25,11 @@ from sim_server.updates.factor_source import Job
 SHARE = POOL_LIMIT // SLOT_SHARE  # bytes of the largest factor that comes in a slot
 
 
-class Number(int):
-    """The number of a job. Whoever looks up that of one that is over lets the thread of the queue send what waits."""
-
-    queue: "Queue"
-
-    def __hash__(self) -> int:
-        if int(self) in self.queue.over:
-            self.queue.send()
-        return int(self)
-
-
-class NumberedLeases(Leases):
-    def next_number(self) -> int:
-        return Number(super().next_number())
-
-
 class Queue:
     """Sends once it is let."""
 
     def __init__(self) -> None:
         self.posted: list[Callable[[], None]] = []
-        self.over: set[int] = set()
 
     def post(self, send: Callable[[], None], name: object = None) -> bool:
         self.posted.append(send)
@@ -80,34 +62,19 @@ def topology(name: str) -> Topology:
     return Topology(header=header, nodes=1, row_start=row_start, columns=columns)
 
 
-def test_jobs_are_sent_while_the_times_of_others_are_forgotten(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(job_sender, "MAX_SENT", 1)
-    queue, one, names = Queue(), OneWorker(), [f"o{k}" for k in range(6)]
-    monkeypatch.setattr(Number, "queue", queue, raising=False)
-    leases, decoder = NumberedLeases(None), FactorDecoder(1)
-    book = Bookkeeping(WorkerRegistry(1, 1.0), leases, WorkerTiming(), WorkerReliability(), decoder, lambda: 7.0)
+def test_a_job_has_left_once_the_network_took_it() -> None:
+    """Not when it was handed over."""
+    queue, one, now = Queue(), OneWorker(), [7.0]
+    leases, decoder = Leases(None), FactorDecoder(1)
+    book = Bookkeeping(WorkerRegistry(1, 1.0), leases, WorkerTiming(), WorkerReliability(), decoder, lambda: now[0])
     sender: Any = JobSender(one, "s", 1, None, queue, Counters(logging.getLogger(__name__)), book, one)  # type: ignore[arg-type]
-    for name in names:
+    for name in ("a", "b"):
         book.announce(topology(name))
-
-    def submit(name: str) -> None:
         assert sender.submit(Job(name, 1, 1, False, np.eye(3)[None]))
-
-    for name in names[:4]:
-        submit(name)
+    assert [(job.sent_at, job.put_at) for job in leases.jobs] == [(7.0, float("inf"))] * 2
+    now[0] = 9.0
     queue.send()
-    over, flying = leases.jobs[:3], leases.jobs[3]
-    for job in over:
-        leases.finish(job)
-    for name in names[4:]:
-        submit(name)
-    queue.over = {int(job.number) for job in over}
-    sender.forget_sent()
-    assert not queue.posted, "these were sent meanwhile"
-    queue.over = set()
-    assert [sender.sent_at(job) for job in over] == [float("inf")] * 3
-    assert len(leases.jobs) == 3 and flying in leases.jobs
-    assert [sender.sent_at(job) for job in leases.jobs] == [7.0] * 3
+    assert [(job.sent_at, job.put_at) for job in leases.jobs] == [(7.0, 9.0)] * 2
 
 
 @pytest.mark.parametrize(

@@ -1,12 +1,15 @@
 # SPDX-License-Identifier: MIT
 """Leases of jobs in flight, without a network."""
 
-from dataclasses import replace
+from typing import Any
 
 import pytest
 
 from protocol.refused import Refused
-from sim_server.network.leases import DELIVERY, MAX_LEASE, MIN_LEASE, InFlightJob, Leases
+from sim_server.network.jobs_in_flight import InFlightJob
+from sim_server.network.lease_terms import DELIVERY, MAX_LEASE, MIN_LEASE
+from sim_server.network.leases import Leases
+from tests.support.in_flight import batch_in_flight, in_flight
 
 
 class Allocator:
@@ -17,10 +20,13 @@ class Allocator:
         self.back += [slot] * users
 
 
-def sent(leases: Leases, object: str = "beam", worker: str = "w", deadline: float = 2.0, epoch: int = 1) -> InFlightJob:
-    number = leases.next_number()
-    started = InFlightJob(number, object, epoch, 1, True, "float32", worker, deadline, slots=(f"slot {number}",))  # type: ignore[arg-type]
-    leases.start(started)
+def sent(
+    leases: Leases, object: str = "beam", worker: str = "w", deadline: float = 2.0, epoch: int = 1, **others: Any
+) -> InFlightJob:
+    (number,) = leases.next_numbers(1)
+    slots = (f"slot {number}",)
+    started = in_flight(number, object, epoch, 1, "float32", worker, deadline, slots=slots, **others)
+    leases.start(started.batch)
     return started
 
 
@@ -52,9 +58,10 @@ def test_answers_of_a_message_free_what_each_would_alone(allocator: Allocator) -
         leases = Leases(allocator)
         sent(leases, "late", deadline=0.5)
         leases.expire(1.0)
-        jobs = [replace(sent(leases, name), slots=("matrices", "factors")) for name in "abcd"]  # type: ignore[arg-type]
-        for job in jobs:
-            leases.start(job)
+        numbers, slots = leases.next_numbers(4), ("matrices", "factors")
+        batch = batch_in_flight(numbers, list("abcd"), 1, 1, "float32", "w", 2.0, slots=slots)
+        leases.start(batch)
+        jobs = batch.jobs
         if together:
             leases.finish_all(jobs[:3], [0.1, 0.2, 0.3])
         else:
@@ -67,8 +74,8 @@ def test_answers_of_a_message_free_what_each_would_alone(allocator: Allocator) -
     assert one.by_object.keys() == other.by_object.keys() == {"d"} and one.count("w") == other.count("w") == 1
     assert one.deadlines() == other.deadlines() and one.expired_count("w") == other.expired_count("w") == 0
     for name in "abcd":
-        assert one.lease(name, "w") == other.lease(name, "w")
-        assert one.exclusive_period(name, 10) == other.exclusive_period(name, 10)
+        assert one.terms.lease(name, "w") == other.terms.lease(name, "w")
+        assert one.terms.exclusive_period(name, 10) == other.terms.exclusive_period(name, 10)
 
 
 @pytest.mark.parametrize(
@@ -146,28 +153,28 @@ def test_an_old_epoch_that_runs_out_or_is_lost_is_no_failure_of_the_new(leases: 
 
 
 def test_leases_follow_the_last_factorization_and_double_when_missed(leases: Leases) -> None:
-    assert leases.lease("beam", "w") == MAX_LEASE, "whoever is asked first may have to compile"
+    assert leases.terms.lease("beam", "w") == MAX_LEASE, "whoever is asked first may have to compile"
     leases.finish(sent(leases), 0.4)
-    assert leases.lease("beam", "w") == pytest.approx(8.0)
+    assert leases.terms.lease("beam", "w") == pytest.approx(8.0)
     for _ in range(2):
         sent(leases, deadline=0.0)
         leases.expire(1.0)
-    assert leases.lease("beam", "w") == pytest.approx(32.0)
+    assert leases.terms.lease("beam", "w") == pytest.approx(32.0)
     for _ in range(20):
         sent(leases, deadline=0.0)
         leases.expire(1.0)
-    assert leases.lease("beam", "w") == MAX_LEASE
+    assert leases.terms.lease("beam", "w") == MAX_LEASE
     leases.finish(sent(leases), 0.1)
-    assert leases.lease("beam", "w") == MIN_LEASE
+    assert leases.terms.lease("beam", "w") == MIN_LEASE
 
 
 def test_the_first_job_that_a_worker_assembles_may_take_its_time(leases: Leases) -> None:
     """It imports and compiles for that, though it has made factors of matrices; so may one by another method."""
     leases.finish(sent(leases), 0.01)
-    assert leases.lease("beam", "w") == MIN_LEASE
-    assert leases.lease("beam", "w", positions=True) == leases.lease("beam", "w", "incomplete") == MAX_LEASE
-    leases.finish(replace(sent(leases), positions=True), 0.01)
-    assert leases.lease("beam", "w", positions=True) == MIN_LEASE
+    assert leases.terms.lease("beam", "w") == MIN_LEASE
+    assert leases.terms.lease("beam", "w", positions=True) == leases.terms.lease("beam", "w", "incomplete") == MAX_LEASE
+    leases.finish(sent(leases, positions=True), 0.01)
+    assert leases.terms.lease("beam", "w", positions=True) == MIN_LEASE
 
 
 @pytest.mark.parametrize("method", ["cholesky", "incomplete"])
@@ -181,9 +188,10 @@ def test_the_terms_of_many_jobs_are_those_of_each_alone(leases: Leases, method: 
     sent(leases, "late", deadline=0.0)
     leases.expire(1.0)
     names = ["after 0.001", "after 0.4", "after 100.0", "at two", "elsewhere", "late", "new"]
-    found = leases.terms([(name, 40_000) for name in names], "w", method)
-    expected = [leases.lease(name, "w", method) for name in names]
-    assert found == (expected, [leases.exclusive_period(name, 40_000) for name in names])
+    leases_, periods = leases.terms.of_all(names, [40_000] * len(names), "w", method)
+    found = leases_.tolist(), periods.tolist()
+    expected = [leases.terms.lease(name, "w", method) for name in names]
+    assert found == (expected, [leases.terms.exclusive_period(name, 40_000) for name in names])
     assert len(set(expected)) == (1 if method == "incomplete" else 5)
 
 
@@ -193,20 +201,23 @@ def test_who_is_late_costs_others_no_time(leases: Leases) -> None:
     for _ in range(5):
         sent(leases, worker="bad", deadline=0.0)
         leases.expire(1.0)
-    assert leases.lease("beam", "good") == pytest.approx(8.0)
+    assert leases.terms.lease("beam", "good") == pytest.approx(8.0)
     leases.finish(sent(leases, worker="slow"), 4.0)
-    assert (leases.lease("beam", "good"), leases.lease("beam", "slow")) == (pytest.approx(8.0), pytest.approx(80.0))
+    assert (leases.terms.lease("beam", "good"), leases.terms.lease("beam", "slow")) == (
+        pytest.approx(8.0),
+        pytest.approx(80.0),
+    )
     leases.remove_worker("good")
     leases.forget_object("beam")
-    assert leases.lease("beam", "slow") == MAX_LEASE
+    assert leases.terms.lease("beam", "slow") == MAX_LEASE
 
 
 def test_an_object_waits_for_a_slow_worker_only_while_there_is_no_other(leases: Leases, allocator: Allocator) -> None:
-    assert leases.exclusive_period("beam", 10) == MIN_LEASE
-    assert leases.exclusive_period("beam", 100_000) == pytest.approx(10.0)
+    assert leases.terms.exclusive_period("beam", 10) == MIN_LEASE
+    assert leases.terms.exclusive_period("beam", 100_000) == pytest.approx(10.0)
     leases.finish(sent(leases, worker="good"), 0.4)
     leases.finish(sent(leases, worker="slow"), 40.0)
-    assert leases.exclusive_period("beam", 10) == pytest.approx(8.0), "as long as the fastest might take"
+    assert leases.terms.exclusive_period("beam", 10) == pytest.approx(8.0), "as long as the fastest might take"
     slow = sent(leases, worker="slow", deadline=99.0)  # exclusive until 0
     assert leases.reassign(0.1, lambda job: False) == [] and leases.by_object == {"beam": slow}
     assert leases.reassign(0.1, lambda job: True) == [slow]
@@ -220,7 +231,7 @@ def test_an_object_waits_for_a_slow_worker_only_while_there_is_no_other(leases: 
 
 
 def test_a_job_that_was_never_sent_leaves_no_trace(leases: Leases, allocator: Allocator) -> None:
-    leases.cancel(sent(leases))
+    leases.cancel([sent(leases)])
     assert (leases.by_object, leases.by_worker, allocator.back) == ({}, {}, ["slot 1"])
 
 
@@ -241,6 +252,8 @@ def test_a_job_is_lost_when_its_worker_keeps_saying_that_it_has_none(leases: Lea
 
 def test_bytes_may_be_on_their_way_for_longer(leases: Leases) -> None:
     some = sent(leases)
-    assert leases.delivery_time(some) == DELIVERY
-    assert leases.delivery_time(replace(some, payload_bytes=2_000_000)) == pytest.approx(DELIVERY + 2)
-    assert leases.delivery_time(replace(some, payload_bytes=1 << 30)) < DELIVERY + 5, "the rest had gone when it left"
+    assert leases.terms.delivery_time(some) == DELIVERY
+    assert leases.terms.delivery_time(sent(leases, payload_bytes=2_000_000)) == pytest.approx(DELIVERY + 2)
+    assert leases.terms.delivery_time(sent(leases, payload_bytes=1 << 30)) < DELIVERY + 5, (
+        "the rest had gone when it left"
+    )

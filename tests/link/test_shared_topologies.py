@@ -11,7 +11,7 @@ from protocol.messages_pb2 import Header, Topology
 from protocol.refused import Refused
 from protocol.validate import checksum
 from sim_server.network.factor_decoder import FactorDecoder
-from sim_server.network.leases import InFlightJob
+from tests.support.in_flight import in_flight
 from tests.worker.block_matrices import bar_edges, pattern, spd
 
 GRAPH = pattern(12, bar_edges(2, 1, 1), np.arange(4))
@@ -48,7 +48,7 @@ def answer(decoder: FactorDecoder, name: str, method: str = "cholesky", epoch: i
         header=header, step=3, warp=True, dtype="float32", pattern=ANALYSIS.pattern.id, nonzeros=len(values),
         checksum=checksum(values),
     )  # fmt: skip
-    job = InFlightJob(1, name, epoch, 3, True, "float32", "w", 9.0, method=method)
+    job = in_flight(1, name, epoch, 3, "float32", "w", 9.0, method=method)
     assert np.array_equal(decoder.decode(message, values.tobytes(), job).values, values)
 
 
@@ -95,7 +95,7 @@ def test_a_factor_of_an_epoch_that_ends_while_it_is_taken_in_tells_nothing_of_th
     message = FactorMessage(
         header=header, step=3, warp=True, dtype="float32", pattern=ANALYSIS.pattern.id, nonzeros=len(values)
     )
-    job = InFlightJob(1, "a", 1, 3, True, "float32", "w", 9.0)
+    job = in_flight(1, "a", 1, 3, "float32", "w", 9.0)
 
     def arriving() -> np.ndarray:
         decoder.announce(topology("a", OTHER, epoch=2))

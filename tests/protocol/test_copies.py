@@ -32,26 +32,19 @@ def test_native_code_has_the_checksum_of_the_package():
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 def test_copies_have_the_checksums_of_their_values(made, dtype):
-    sources = arrays(dtype)
-    targets = [np.full_like(each, np.nan) for each in sources]
-    assert made.copy(sources, targets) == [checksum(each) for each in sources]
-    for source, target in zip(sources, targets, strict=True):
-        np.testing.assert_array_equal(target, source)
-
-
-def test_what_others_write_to_the_targets_changes_no_checksum(made):
-    sources = arrays(np.float32)
-    bytes_of_targets = [np.zeros(each.nbytes, np.uint8) for each in sources]
-    assert made.copy(sources, bytes_of_targets, own_sources=True) == [checksum(each) for each in sources]
-    assert [each.tobytes() for each in bytes_of_targets] == [each.tobytes() for each in sources]
+    sources = [*arrays(dtype), np.arange(24.0).astype(dtype).reshape(4, 6)[:, ::2]]  # the last one is not contiguous
+    whole = b"".join(each.tobytes() for each in sources)
+    target = np.full(len(whole) + 64, 7, np.uint8)
+    assert made.gather(sources, target) == [checksum(np.ascontiguousarray(each)) for each in sources]
+    assert target.tobytes() == whole + bytes([7] * 64)
 
 
 def test_many_large_arrays_are_shared_by_threads(made, monkeypatch):
     monkeypatch.setattr(module, "helping_threads", lambda: 3)
     sources = arrays(np.float64, [ALONE // 8 // 6] * 9)
-    targets = [np.empty_like(each) for each in sources]
-    assert made.copy(sources, targets) == [checksum(each) for each in sources]
-    assert all((target == source).all() for source, target in zip(sources, targets, strict=True))
+    target = np.empty(sum(each.nbytes for each in sources), np.uint8)
+    assert made.gather(sources, target) == [checksum(each) for each in sources]
+    np.testing.assert_array_equal(target.view(np.float64), np.concatenate(sources))
 
 
 NO_THREADS = """
@@ -63,13 +56,14 @@ from protocol.validate import ALONE, checksum
 module.helping_threads = lambda: 3
 made = module.Copies(ctypes.CDLL(sys.argv[1]))
 sources = [np.full(ALONE // 8, float(k)) for k in range(3)]
-targets = [np.zeros_like(each) for each in sources]
+target = np.zeros(3 * ALONE, np.uint8)
 with open("/proc/self/statm") as file:
     taken = int(file.read().split()[0]) * resource.getpagesize()
 before = resource.getrlimit(resource.RLIMIT_AS)
 resource.setrlimit(resource.RLIMIT_AS, (taken + (1 << 20), before[1]))  # less than a stack
-sums = made.copy(sources, targets)
+sums = made.gather(sources, target)
 resource.setrlimit(resource.RLIMIT_AS, before)
+targets = np.split(target.view(np.float64), 3)
 print(all(np.array_equal(s, t) for s, t in zip(sources, targets)), sums == [checksum(t) for t in targets])
 """
 
@@ -81,9 +75,9 @@ def test_where_the_system_gives_no_more_threads_one_copies_all():
     assert (found.returncode, found.stdout.split()) == (0, ["True"] * 2), found.stderr
 
 
-def test_sizes_that_differ_are_a_mistake_of_the_caller(made):
-    with pytest.raises(ValueError):
-        made.copy([np.zeros(4)], [np.zeros(3)])
+def test_too_small_a_target_is_a_mistake_of_the_caller(made):
+    with pytest.raises(ValueError, match="outside of its"):
+        made.gather([np.zeros(4), np.zeros(4)], np.zeros(63, np.uint8))
 
 
 PARTS = np.array([8, 4096, 800, 100]), np.array([0, 4112, 24, 640])  # bytes of parts, and where each begins

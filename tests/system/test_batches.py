@@ -4,7 +4,8 @@
 import math
 import os
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -26,6 +27,7 @@ from sim_server.network.send_queue import SendQueue
 from sim_server.network.worker_timing import WorkerTiming
 from sim_server.updates.factor_check import FactorCheck
 from sim_server.updates.factor_source import Job
+from sim_server.updates.jobs_together import JobsTogether
 from sim_server.updates.take_in import SentMatrices
 from tests.ports import free_endpoint
 
@@ -69,13 +71,15 @@ class Hand:
             self.hand.answer(answer, values)
             self.driver.until(lambda name=name: any(f.object == name for f in self.driver.factors), "a first factor")
 
-    def batch(self, names: tuple[str, ...] = NAMES) -> MatrixBatch:
+    def batch(
+        self, names: tuple[str, ...] = NAMES, form: Callable[[list[Job]], Sequence[Job]] = list
+    ) -> MatrixBatch:  # fmt: skip
         """Has the server send one; its matrices are what was given."""
         self.step += 1
         self.driver.factors.clear()
         self.driver.failures.clear()
         self.driver.until(lambda: self.driver.link.dispatch.ready() >= len(names), "room")
-        assert self.driver.link.dispatch.submit_many(jobs(self.step, names)) == [True] * len(names)
+        assert self.driver.link.dispatch.submit_many(form(jobs(self.step, names))) == [True] * len(names)
         sample = self.driver.until(self.received.try_recv, "the batch")
         batch = MatrixBatch.FromString(bytes(sample.attachment))
         values = self.slots.array(batch.matrix_slot, np.float64, 9 * sum(batch.blocks))
@@ -162,31 +166,45 @@ def test_answers_may_come_in_parts_and_in_any_order(stage: Hand) -> None:
     assert stage.driver.link.slots_lent == 0
 
 
-def test_jobs_that_are_looked_up_at_once_travel_as_those_looked_up_one_by_one(
-    stage: Hand, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    found, real, used, senders = [], JobSender.alike, [], set()
+def test_jobs_by_columns_travel_as_a_list_of_them(stage: Hand, monkeypatch: pytest.MonkeyPatch) -> None:
+    """All at once, as long as one worker has room and all may share batches; else one by one."""
+    one_by_one, real, told = list[int](), JobSender.submit_sorted, []
 
-    def alike(sender: JobSender, given: Any) -> Any:
-        senders.add(sender)
-        used.append(real(sender, given))
-        return used[-1] if found else None
+    def submit_sorted(sender: JobSender, jobs: Sequence[Job], *others: Any) -> list[bool]:
+        one_by_one.append(len(jobs))
+        return real(sender, jobs, *others)
 
+    monkeypatch.setattr(JobSender, "submit_sorted", submit_sorted)
+    dispatch = stage.driver.link.dispatch
     for name in NAMES:
-        stage.driver.link.dispatch.factor_helped("hand", name)  # what failed in other tests is forgotten
-    monkeypatch.setattr(JobSender, "alike", alike)
-    for _ in range(2):
-        batch = stage.batch()
-        found.append({name: list(getattr(batch, name)) for name in ("objects", "epochs", "warps", "blocks", "rooms")})
+        dispatch.factor_helped("hand", name)  # what failed in other tests is forgotten
+    for form in (list, JobsTogether.of):
+        batch = stage.batch(form=form)
+        told.append({name: list(getattr(batch, name)) for name in ("objects", "epochs", "warps", "blocks", "rooms")})
         stage.send(stage.answer(batch))
         stage.driver.until(lambda: stage.made() == set(NAMES), "their factors")
-    assert found[0] == found[1] and None not in used and len(used) == 2
-    (sender,), flying = senders, stage.batch(("a", "b"))
-    assert real(sender, jobs(950, ("b", "c"))) is None, "one has a job in flight"
-    assert real(sender, [*jobs(950, ("c",)), *jobs(951, ("c",))]) is None, "twice the same"
-    assert real(sender, [*jobs(950, ("c",)), *jobs(950, ("d",), dtype="float64")]) is None
+    assert told[0] == told[1] and one_by_one == [4]
+    flying = stage.batch(("a", "b"), form=JobsTogether.of)
+    assert one_by_one == [4] and dispatch.submit_many(JobsTogether.of(jobs(950, ("b",) * 2))) == [False] * 2
     stage.send(stage.answer(flying))
     stage.driver.until(lambda: stage.made() == {"a", "b"}, "their factors")
+    with pytest.raises(ValueError, match="not announced"):
+        dispatch.submit_many(JobsTogether.of([replace(job, epoch=2) for job in jobs(950)]))
+    with pytest.raises(ValueError, match="values"):
+        dispatch.submit_many(JobsTogether.of([replace(job, values=job.values[1:]) for job in jobs(950)]))
+    assert one_by_one == [4, 2, 4, 4] and not dispatch.leases.jobs
+
+
+def test_jobs_for_which_there_is_no_room_are_not_taken(stage: Hand) -> None:
+    dispatch = stage.driver.link.dispatch
+    stage.hello(most_jobs=3)
+    stage.driver.until(lambda: dispatch.ready() == 3, "the hello")
+    assert dispatch.submit_many(JobsTogether.of(jobs(960))) == [True] * 3 + [False]
+    stage.step, sample = 960, stage.driver.until(stage.received.try_recv, "the batch")
+    stage.send(stage.answer(MatrixBatch.FromString(bytes(sample.attachment))))
+    stage.driver.until(lambda: stage.made() >= {"a", "b", "c"} and not dispatch.leases.jobs, "their factors")
+    stage.hello()
+    stage.driver.until(lambda: dispatch.ready() == 64, "the hello")
 
 
 def test_an_object_alone_goes_as_ever(stage: Hand) -> None:
@@ -461,8 +479,7 @@ def test_slots_are_not_lent_again_before_they_are_sent(stage: Hand, monkeypatch:
     stage.driver.until(lambda: dispatch.ready() >= len(NAMES) and not stage.driver.link.slots_lent, "room")
     monkeypatch.setattr(SendQueue, "post", lambda queue, send, name=None: held.append(send) or True)
     assert dispatch.submit_many(jobs(950)) == [True] * len(NAMES)
-    for job in dispatch.leases.jobs:
-        dispatch.leases.cancel(job)
+    dispatch.leases.cancel(dispatch.leases.jobs)
     stage.driver.turn()
     assert len(held) == 1 and stage.driver.link.slots_lent == 2
     held[0]()

@@ -97,7 +97,7 @@ def noted(driver: Driver) -> list[tuple]:
 
 def test_many_factors_say_what_each_says():
     """Late ones, ones that nobody asked for, from here and from elsewhere; after failures and with excess summed up."""
-    one, many = drivers("cholesky")
+    one, many = drivers("auto")  # by which methods are remembered
     rng = np.random.default_rng(0)
     for step in range(10, 200, 3):
         chosen = rng.permutation(BODIES)[: rng.integers(1, BODIES + 1)].tolist()

@@ -345,6 +345,10 @@ class CpuEngine(Reports):
         """Returns 0, likewise."""
         return 0
 
+    def staged_matrices(self, bodies: Int64) -> Int64:
+        """Returns 0 of each of some bodies."""
+        return np.zeros(len(bodies), np.int64)
+
     def factor_memory(self, count: int, dtype: np.dtype[Any]) -> NDArray[Any]:
         """Makes an array for values of a factor."""
         return np.empty(count, dtype)
@@ -407,9 +411,9 @@ class CpuEngine(Reports):
         """Step of the copy asked for last, -1 while it is not there. `step` counts the steps completed before it."""
         return int(self._body[body].snapshot_step)
 
-    def matrix_steps(self, bodies: Sequence[int]) -> Int64:
+    def matrix_steps(self, bodies: Int64) -> Int64:
         """The same of some bodies."""
-        return np.array([self._body[body].snapshot_step for body in bodies], np.int64)
+        return np.array([self._body[body].snapshot_step for body in bodies.tolist()], np.int64)
 
     def prepare_copies(self) -> None:
         """Does nothing: who asks for a copy gives its memory."""
@@ -418,7 +422,7 @@ class CpuEngine(Reports):
         """The loop copies to where it is told."""
         return None
 
-    def request_matrices(self, bodies: Sequence[int]) -> None:
+    def request_matrices(self, bodies: Int64) -> None:
         """Does nothing, as there is no such memory."""
         return None
 

@@ -281,19 +281,18 @@ class DeviceLoop(Reports):
         one behind it leaves alone; None: where matrices are large, or of another type."""
         return self._memory_at(body, self._other_place(body)) if self._has_copy_memory else None
 
-    def request_matrices(self, bodies: Sequence[int]) -> list[Float64] | None:
+    def request_matrices(self, bodies: Int64) -> list[Float64] | None:
         """Requests the matrices of some bodies, each as `request_matrix` does for its `copy_memory`, and returns that
         memory; None, and requests none: where there is no such memory."""
         if not self._has_copy_memory:
             return None
         self._staging()
-        rows = np.array(bodies, np.int64)
-        places = self._other_places(rows)
-        self._staged_at[rows] = places
-        self._copied_steps[rows] = -1
-        self._requests[rows] = structs.REQUEST_VALUES  # last, as in `_request`
+        places = self._other_places(bodies)
+        self._staged_at[bodies] = places
+        self._copied_steps[bodies] = -1
+        self._requests[bodies] = structs.REQUEST_VALUES  # last, as in `_request`
         self.loop.requested = 1
-        return [self._memory_at(body, place) for body, place in zip(bodies, places.tolist(), strict=True)]
+        return [self._memory_at(body, place) for body, place in zip(bodies.tolist(), places.tolist(), strict=True)]
 
     @property
     def _has_copy_memory(self) -> bool:
@@ -350,17 +349,21 @@ class DeviceLoop(Reports):
             target[...] = data.view(self._real).reshape(target.shape)
         return step
 
-    def matrix_steps(self, bodies: Sequence[int]) -> Int64:
+    def matrix_steps(self, bodies: Int64) -> Int64:
         """Returns the same of each of some bodies."""
         if not self._targets:
-            steps: Int64 = self._copied_steps[list(bodies)]
+            steps: Int64 = self._copied_steps[bodies]
             return steps
-        return np.array([self.matrix_step(body) for body in bodies], np.int64)
+        return np.array([self.matrix_step(body) for body in bodies.tolist()], np.int64)
 
     def staged_matrix(self, body: int) -> int:
         """Returns the device address of the copy requested last, once it is complete: the same float64 values
         (blocks, 3, 3), until the next request. 0: there is none."""
-        staged = self.loop.staged
-        if not staged or self._copied_steps[body] < 0 or self._real != np.float64:
-            return 0
-        return int(staged) + int(self._staged_at[body])
+        return int(self.staged_matrices(np.array([body]))[0])
+
+    def staged_matrices(self, bodies: Int64) -> Int64:
+        """Returns the same of each of some bodies."""
+        if not self.loop.staged or self._real != np.float64:
+            return np.zeros(len(bodies), np.int64)
+        at: Int64 = np.where(self._copied_steps[bodies] < 0, 0, int(self.loop.staged) + self._staged_at[bodies])
+        return at

@@ -9,9 +9,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sim_server.arrays import Float64
-from sim_server.updates.body_state import BodyUpdateState, on_sent
-from sim_server.updates.factor_source import Job
+from sim_server.arrays import Float64, Int64
+from sim_server.updates.body_state import on_sent
 from sim_server.updates.policies.base import UpdatePolicy
 from sim_server.updates.prefetch import PrefetchDepth
 from sim_server.updates.scheduler import (
@@ -22,6 +21,7 @@ from sim_server.updates.scheduler import (
     overdue_after,
     pick,
 )
+from sim_server.updates.update_table import NONE
 
 if TYPE_CHECKING:
     from sim_server.updates.driver import Driver
@@ -52,6 +52,10 @@ class Async(UpdatePolicy):
 
     def pump(self) -> None:
         """Makes an exchange with the workers and adapts the prefetch depth to the time of steps."""
+        with self.driver.source.round():
+            self._pump()
+
+    def _pump(self) -> None:
         driver = self.driver
         if self.prefetch.on_step(driver.engine.step, time.monotonic()) and not driver.counted:
             self.prefetch.update(driver.table.cost, driver.source.worker_count(), driver.source.queues_jobs())
@@ -99,9 +103,11 @@ class Async(UpdatePolicy):
                 chosen += pick(requests, room, solver.update_floor_steps, solver.schedule, overdue)
         chosen = chosen[left:]
         # Request their matrices; in advance only those of bodies that need a factor
-        states = [driver.bodies[body] for body in chosen]
-        wanted = states[:idle] + [s for s in states[idle:] if s.job.sent is None or s.solves.excess > 0]
-        driver.snapshots.request_all(wanted)
+        table, rows = driver.table, np.array(chosen, np.int64)
+        needed = (table.sent[rows] == NONE) | (table.excess[rows] > 0)
+        needed[:idle] = True
+        wanted = rows[needed]
+        driver.snapshots.request_all(wanted, driver.bodies)
         if len(wanted) < places:
             self._exhausted = step
 
@@ -136,32 +142,35 @@ class Async(UpdatePolicy):
 
     def _send_copies(self) -> None:
         """Sends copies to idle workers in the order of the requests. With a prefetch depth others wait their turn."""
-        driver = self.driver
-        copied = driver.snapshots.completed()
-        if new := [state.job for state, _ in copied if state.job.request > self._newest_copy]:
-            self._newest_copy = new[-1].request
-            self.prefetch.on_copy(time.monotonic() - sum(job.requested for job in new) / len(new))
-        idle, now = driver.source.ready() if copied else 0, driver.engine.step
-        made: list[tuple[BodyUpdateState, Job]] = []
-        for state, step in copied:
-            if idle <= len(made) and self.prefetch.depth:
-                if now - step > self.prefetch.patience:
-                    driver.snapshots.discard(state)
-                continue
-            if (job := driver.make_job(state, step)) is not None:
-                made.append((state, job))
-        self.prefetch.on_sent(len(made), time.monotonic())
-        if not made:
+        driver, now = self.driver, time.monotonic()
+        bodies, steps = driver.snapshots.completed()
+        self._note_copies(bodies, now)
+        if self.prefetch.depth and len(bodies):
+            idle = driver.source.ready()
+            late = driver.engine.step - steps[idle:] > self.prefetch.patience
+            self._discard(bodies[idle:][late])
+            bodies, steps = bodies[:idle], steps[:idle]
+        jobs = driver.make_jobs(bodies, steps) if len(bodies) else []
+        self.prefetch.on_sent(len(jobs), now)
+        if not jobs:
             return
-        sent: list[tuple[int, int]] = []
-        for (state, job), taken in zip(made, driver.source.submit_many([job for _, job in made]), strict=True):
-            if taken:
-                state.job.on_sent(job.step)
-                sent.append((state.body.index, job.step))
-            else:
-                driver.snapshots.discard(state)
-        if sent:
-            on_sent(driver.table, *zip(*sent, strict=True))
+        if len(jobs) < len(bodies):  # others were discarded
+            bodies = np.array([driver.by_name[job.object].body.index for job in jobs], np.int64)
+            steps = np.array([job.step for job in jobs], np.int64)
+        taken = np.array(driver.source.submit_many(jobs), np.bool_)
+        on_sent(driver.table, bodies[taken], steps[taken])
+        self._discard(bodies[~taken])
+
+    def _note_copies(self, bodies: Int64, now: float) -> None:
+        """Takes note of how long copies took that are there, in the order of their requests."""
+        table = self.driver.table
+        if len(new := bodies[table.request[bodies] > self._newest_copy]):
+            self._newest_copy = int(table.request[new[-1]])
+            self.prefetch.on_copy(now - float(table.requested[new].mean()))
+
+    def _discard(self, bodies: Int64) -> None:
+        for body in bodies.tolist():
+            self.driver.snapshots.discard(self.driver.bodies[body])
 
     def _jobs(self) -> float:
         """Number of jobs on their way at a time, one at each worker at least; 0 without workers."""

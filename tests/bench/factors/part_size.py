@@ -21,8 +21,8 @@ from protocol.messages_pb2 import Header
 from protocol.network.session import Session, open_session
 from protocol.shared_memory.pool import SlotPool, SlotsUnusable
 from sim_server.network.factor_fetch import AHEAD, FactorFetch
-from sim_server.network.leases import InFlightJob
 from tests.ports import free_endpoint
+from tests.support.in_flight import in_flight
 
 SIZES = tuple(1 << k for k in range(20, 27))
 COUNTERS = Counters(logging.getLogger(__name__))
@@ -64,7 +64,7 @@ def _once(
     """Returns time and processor time [s] of one factor, without the checksums that announce it."""
     parts = offered.offer("beam", Header(protocol=PROTOCOL, incarnation=1), 1, values, part_bytes)
     slots = [] if pool is None else [pool.lend(part_bytes) for _ in range(AHEAD)]
-    job = InFlightJob(1, "beam", 1, 1, True, "float32", "w", 0.0, part_bytes=part_bytes)
+    job = in_flight(1, "beam", 1, 1, "float32", "w", 0.0, part_bytes=part_bytes)
     fetch = FactorFetch(server.zenoh, "sim", 1, COUNTERS, job, len(values), parts, [s for s in slots if s is not None])
     wall, cpu = time.perf_counter(), time.process_time()
     got = fetch.run()

@@ -65,9 +65,9 @@ class PacedLoop:
         """Step of the copy; -1: there is none yet."""
         return int(self._copied[body])
 
-    def matrix_steps(self, bodies: Sequence[int]) -> NDArray[np.int64]:
+    def matrix_steps(self, bodies: NDArray[np.int64]) -> NDArray[np.int64]:
         """Steps of the copies of some bodies."""
-        return self._copied[list(bodies)]
+        return self._copied[bodies]
 
     def post_factors(self, bodies: Sequence[int], factors: Sequence[Factor]) -> None:
         """Takes factors as the engine does."""
