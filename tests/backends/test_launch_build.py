@@ -6,10 +6,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+from protocol.shared_memory.located import addresses
 from sim_server.backends.gpu import structs
 from sim_server.backends.gpu.device_values import DeviceValues
 from sim_server.backends.gpu.mailbox import library
-from sim_server.backends.gpu.pinned import PinnedArray, readable, runs
+from sim_server.backends.gpu.pinned import PinnedArray, readable
 from tests.backends.fake_cuda import FakeDevice
 
 FLOAT32, HEAD = np.dtype(np.float32), np.arange(100, 108, dtype=np.uint8)
@@ -38,12 +39,12 @@ class Launch:
 
     def __call__(self, values: list[Any], done: int | None = DONE) -> int:
         kept, values_are = readable(values, FLOAT32)
-        copies = np.array(runs(kept), np.int64)
-        self.kept = kept, copies
+        sources = addresses(kept)
+        self.kept = kept, sources
         return int(library().wf_launch_build(self.device.functions, structs.BuildLaunch(
             stream=self.device.stream, copied=COPIED, done=done, graph=GRAPH, head=HEAD.ctypes.data,
             head_bytes=len(HEAD), staging=self.staging.ctypes.data, incoming=self.incoming.ctypes.data,
-            runs=copies.ctypes.data, count=len(copies), values_are=values_are,
+            sources=sources.ctypes.data, count=len(kept), bytes=kept[0].nbytes, values_are=values_are,
         )))  # fmt: skip
 
     def end(self, event: int = DONE) -> None:
@@ -73,9 +74,17 @@ def test_the_build_finds_all_values_behind_the_head(kind):
     assert launch(values(kind)) == 0
     launch.end()
     assert launch.found[:12].tolist() == list(range(12))
-    copies = {"page-locked": 2, "on the device": 1, "both": 1}.get(kind, 1)  # those that lie together are one
-    assert launch.device.calls.count("to_device") == copies
+    assert launch.device.calls.count("to_device") == (2 if kind == "page-locked" else 1), "of the head; of the rows"
     assert launch.device.calls.count("on_device") == (3 if kind == "on the device" else 0)
+
+
+def test_values_that_lie_one_behind_the_other_are_copied_together():
+    launch, memory = Launch(), np.arange(40, dtype=np.float32).view(PinnedArray)
+    order = [0, 1, 2, 4, 5, 9, 3]
+    assert launch([memory[4 * k : 4 * k + 4] for k in order]) == 0
+    launch.end()
+    assert launch.found[:28].reshape(7, 4)[:, 0].tolist() == [4 * k for k in order]
+    assert launch.device.calls.count("to_device") == 1 + 4
 
 
 def test_memory_is_written_again_only_once_what_was_in_it_is_copied():

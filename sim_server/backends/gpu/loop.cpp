@@ -13,7 +13,7 @@
 #include "../cpu/native/pair_wrenches.h"
 #include "../cpu/native/sizes.h"
 #include "../cpu/native/start_of_balance.h"
-#include "inverse/launch_build.h"
+#include "launch_build.h"
 #include "readback.h"
 #include "step_form.h"
 

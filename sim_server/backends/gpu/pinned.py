@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from protocol.shared_memory.located import Located, addresses
+from protocol.shared_memory.located import Located
 from sim_server.backends.gpu.device_values import DeviceValues
 from sim_server.backends.gpu.structs import BUILD
 
@@ -51,13 +51,3 @@ def readable(
         if on_device in (0, len(arrays)):
             return arrays, WHERE["ON_DEVICE"] if on_device else WHERE["PAGE_LOCKED"]
     return [np.ascontiguousarray(np.asarray(each), dtype) for each in arrays], WHERE["PAGEABLE"]
-
-
-def runs(arrays: Sequence[NDArray[Any] | DeviceValues]) -> list[tuple[int, int, int]]:
-    """Returns the copies that put arrays one behind the other, one for arrays that lie so already: first byte of the
-    target, address of the source, bytes."""
-    places, sizes = addresses(arrays).astype(np.int64), np.array([each.nbytes for each in arrays], np.int64)
-    begins = np.cumsum(sizes) - sizes
-    first = np.flatnonzero(np.append(True, places[1:] != places[:-1] + sizes[:-1]))
-    lengths = np.add.reduceat(sizes, first)
-    return list(zip(begins[first].tolist(), places[first].tolist(), lengths.tolist(), strict=True))

@@ -7,7 +7,7 @@ from sim_server.backends.declarations import Declarations
 
 LOOP = Declarations("backends/gpu/loop.h")
 RECORDS = Declarations("backends/gpu/step_records.cu")
-BUILD = Declarations("backends/gpu/inverse/launch_build.h")
+BUILD = Declarations("backends/gpu/launch_build.h")
 PCG = Declarations("backends/gpu/pcg_structs.cuh")
 STAGES = Declarations("backends/gpu/stages.cuh")
 CONTACT = Declarations("backends/gpu/contact_state.cuh")

@@ -6,12 +6,13 @@ build_inverse.cu. Memory is allocated only when an InverseBuilder or an InverseS
 """
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from protocol.factor import FactorPattern
+from protocol.shared_memory.located import addresses
 from sim_server.arrays import Float64
 from sim_server.backends.gpu import structs
 from sim_server.backends.gpu.cuda import driver_functions
@@ -35,7 +36,7 @@ from sim_server.backends.gpu.inverse.partition import COLUMNS, ROWS
 from sim_server.backends.gpu.inverse.plan import Plan
 from sim_server.backends.gpu.inverse.workspace import workspace
 from sim_server.backends.gpu.mailbox import library
-from sim_server.backends.gpu.pinned import readable, runs
+from sim_server.backends.gpu.pinned import readable
 
 FLOAT32 = np.dtype(np.float32)
 ALIGNMENT = 64  # numbers; 256 bytes, as of what is allocated alone
@@ -190,12 +191,12 @@ class InverseBuilder:
         head["targets"][:count] = targets.view(INVERSE_STORAGE).ravel()
         graph, stream = self._graph(multiprocessors, next(c for c in COUNTS if c >= count)), space.stream
         values, values_are = readable(values, FLOAT32)
-        copies = np.array(runs(values), np.int64)
-        done: Event = cp.cuda.Event(disable_timing=True)
+        sources, done = addresses(values), cp.cuda.Event(disable_timing=True)
         launch = structs.BuildLaunch(
             stream=stream.ptr, copied=space.copied.ptr, done=0 if helped else done.ptr, graph=int(graph.graphExec),
             head=head.ctypes.data, head_bytes=HEAD, staging=space.staging.ctypes.data,
-            incoming=int(space.incoming.data.ptr), runs=copies.ctypes.data, count=len(copies), values_are=values_are,
+            incoming=int(space.incoming.data.ptr), sources=sources.ctypes.data, count=count,
+            bytes=4 * self._nonzeros, values_are=values_are,
         )  # fmt: skip
         error = library().wf_launch_build(driver_functions(), launch)
         space.source = list(values)
@@ -206,7 +207,7 @@ class InverseBuilder:
                 if each.far:
                     self._helper.copy(each.far, each.matrix, each.scale, stream)
             done.record(stream)
-        return done
+        return cast(Event, done)
 
     def _graph(self, limit: int | None, count: int) -> Graph:
         """Returns the graph of a build of up to `count` inverses that keeps at most `limit` multiprocessors busy."""
