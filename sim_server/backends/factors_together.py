@@ -5,6 +5,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, TypeVar, overload
 
+import numpy as np
 from numpy.typing import NDArray
 
 from protocol.factor import Factor, FactorPattern
@@ -20,6 +21,7 @@ class FactorsTogether(Sequence[Factor]):
     values: (nonzeros,) of each
     reasons: why each is not to be used, empty if it is; None: they were not checked
     planes: float16 numbers an entry that the inverse of each needs (backends/gpu/inverse/digits.py); None: not known
+    bodies: numbers of the objects; None: not told
     """
 
     pattern: FactorPattern
@@ -34,6 +36,7 @@ class FactorsTogether(Sequence[Factor]):
     remedies: list[str]
     reasons: list[str] | None = None
     planes: list[int] | None = None
+    bodies: NDArray[np.int64] | None = None
 
     def __len__(self) -> int:
         return len(self.objects)
@@ -64,4 +67,5 @@ class FactorsTogether(Sequence[Factor]):
             chosen(self.warps), chosen(self.values), chosen(self.seconds), chosen(self.remedies),
             None if self.reasons is None else chosen(self.reasons),
             None if self.planes is None else chosen(self.planes),
+            None if self.bodies is None else self.bodies[list(rows)],
         )  # fmt: skip

@@ -4,7 +4,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,10 +13,13 @@ from protocol.factor import FactorPattern, check_values
 from protocol.messages_pb2 import FactorBatch
 from protocol.refused import Refused
 from protocol.shared_memory.copies import Parts
+from sim_server.arrays import Int64
 from sim_server.backends.factors_together import FactorsTogether
-from sim_server.network.factor_decoder import LARGE, AnnouncedObject, FactorDecoder, check_slot, slot_of
-from sim_server.network.leases import InFlightJob
+from sim_server.network.factor_decoder import LARGE, AnnouncedObject, FactorDecoder, check_slot
+from sim_server.network.jobs_in_flight import InFlightJob, JobsInFlight
 from sim_server.updates.take_in import BeginCheck, SentMatrices, TakenIn, take_in
+
+T = TypeVar("T")
 
 
 class DecodedFactors(NamedTuple):
@@ -33,7 +36,7 @@ class AnswerColumns:
     seconds: list[float]
     nonzeros: list[int]
     patterns: list[int]
-    checksums: list[int]
+    checksums: NDArray[np.uint64]
     remedies: list[str]
     slot: tuple[str, int, int]
 
@@ -42,7 +45,8 @@ class AnswerColumns:
         """Returns them of a message."""
         slot, remedies = message.slot, list(message.remedies) or [""] * len(message.jobs)
         return cls(
-            list(message.seconds), list(message.nonzeros), list(message.patterns), list(message.checksums), remedies,
+            list(message.seconds), list(message.nonzeros), list(message.patterns),
+            np.array(message.checksums, np.uint64), remedies,
             (slot.segment, slot.offset, slot.generation),
         )  # fmt: skip
 
@@ -51,91 +55,130 @@ class Expected(NamedTuple):
     """Answers that bring a factor of a known pattern which has room in its slot, by columns.
 
     answers: places among those that were asked for
-    told: places in the message
+    told: places in the message; places: in their batch
     """
 
-    answers: Sequence[int]
-    told: Sequence[int]
-    jobs: Sequence[InFlightJob]
-    known: Sequence[AnnouncedObject]
-    patterns: Sequence[FactorPattern]
+    batch: JobsInFlight
+    answers: list[int]
+    told: list[int]
+    places: list[int]
+    known: list[AnnouncedObject]
+    patterns: list[FactorPattern]
+
+    def of_batch(self, column: Sequence[T]) -> list[T]:
+        """Returns some of the entries of a column of the batch."""
+        return [column[place] for place in self.places]
+
+    def of(self, rows: Sequence[int]) -> "Expected":
+        """Returns some of them."""
+        if len(rows) == len(self.answers):
+            return self
+        columns: Any = ([column[row] for row in rows] for column in self[1:])
+        return Expected(self.batch, *columns)
 
     def begin(self, begin_check: BeginCheck) -> SentMatrices | None:
         """Returns what the factors are checked with; None: they are checked later."""
-        jobs = self.jobs
-        objects, epochs = [job.object for job in jobs], [job.epoch for job in jobs]
-        return begin_check(objects, epochs, [job.step for job in jobs], self.patterns)
+        batch = self.batch
+        if not len(batch.matrices) or batch.positions:
+            return None
+        objects, epochs = self.of_batch(batch.objects), self.of_batch(batch.epochs)
+        return begin_check(objects, epochs, self.patterns, self.of_batch(batch.matrices))
+
+    @property
+    def bodies(self) -> Int64 | None:
+        """Numbers by which the sender of jobs knows their objects, if it has told them."""
+        return None if self.batch.bodies is None else self.batch.bodies[self.places]
 
 
-NOTHING = Expected((), (), (), (), ())
+NONE = DecodedFactors([], [])
 
 
 def decode_several(
-    decoder: FactorDecoder, message: FactorBatch, answers: Sequence[tuple[int, InFlightJob]],
+    decoder: FactorDecoder, message: FactorBatch, jobs: Sequence[InFlightJob], told: Sequence[int],
     begin_check: BeginCheck | None = None,
 ) -> DecodedFactors:  # fmt: skip
-    """Returns the factors at some places of a message, and why others are refused. From any thread.
+    """Returns the factors that answer jobs of one batch, and why others are refused. From any thread.
 
     They are copied, and checked, by one call of native code: they must not change any more once they are checked.
 
+    told: places of the answers in the message
     begin_check: None: what needs their matrices is checked later
     """
     columns = AnswerColumns.of(message)
-    found, refused = _expected(decoder, columns, answers)
-    if not found.jobs:
+    found, refused = _expected(decoder, columns, jobs, told)
+    if not found.answers:
         return DecodedFactors([], refused)
     sent = None if begin_check is None else found.begin(begin_check)
     taken = _taken(decoder, found, sent)
-    wrong = _wrong(columns, found, taken)
-    rows: dict[tuple[FactorPattern, str], list[int]] = {}  # of good ones by pattern and method
-    for row, (job, pattern) in enumerate(zip(found.jobs, found.patterns, strict=True)):
+    wrong, method = _wrong(columns, found, taken), found.batch.method
+    rows: dict[int, list[int]] = {}  # of good ones by pattern
+    for row, pattern in enumerate(found.patterns):
         if row not in wrong:
-            rows.setdefault((pattern, job.method), []).append(row)
-            decoder.note_size(found.known[row], pattern, job)
-    good = [_together(columns, found, taken, own, sent) for own in rows.values()]
+            rows.setdefault(pattern.id, []).append(row)
+            decoder.note_size(found.known[row], pattern, found.batch.objects[found.places[row]], method)
+    good = [_together(columns, found.of(own), taken.of(own), sent) for own in rows.values()]
     return DecodedFactors(good, [*refused, *((found.answers[row], why) for row, why in wrong.items())])
 
 
 def _expected(
-    decoder: FactorDecoder, columns: AnswerColumns, answers: Sequence[tuple[int, InFlightJob]]
+    decoder: FactorDecoder, columns: AnswerColumns, jobs: Sequence[InFlightJob], told: Sequence[int]
 ) -> tuple[Expected, list[tuple[int, Refused]]]:  # fmt: skip
     """Returns the answers that are as expected, and why others are refused."""
-    found: list[tuple[int, int, InFlightJob, AnnouncedObject, FactorPattern]] = []
+    batch, objects = jobs[0].batch, decoder.objects
+    slot, item, epochs = batch.factor_slot, np.dtype(batch.dtype).itemsize, batch.epochs
+    rooms = [room or (slot.capacity if slot else 0) for room in batch.rooms.tolist()]
+    lent = slot is not None and columns.slot == (slot.segment, slot.offset, batch.factor_generation)
+    found: list[tuple[int, int, int, AnnouncedObject, FactorPattern]] = []
     refused: list[tuple[int, Refused]] = []
-    for k, (place, job) in enumerate(answers):
-        nonzeros, id = columns.nonzeros[place], columns.patterns[place]
-        try:
-            if not 0 <= (seconds := columns.seconds[place]) < math.inf:
-                raise Refused(f"FactorBatch.seconds has {seconds}; allowed: finite, 0 or more", "malformed")
-            known = decoder.known(job)
-            pattern = known.complete.patterns.get(id) or known.patterns.get(id)
-            if pattern is None:
-                raise Refused(f"FactorBatch.patterns has {id:016x}, which was not sent", "pattern")
-            if nonzeros != pattern.nonzeros:
-                raise Refused(f"FactorBatch.nonzeros has {nonzeros}; allowed: {pattern.nonzeros}", "shape")
-            check_slot(columns.slot, nonzeros, job)
-            found.append((k, place, job, known, pattern))
-        except Refused as refusal:
-            refused.append((k, refusal))
-    return Expected(*zip(*found, strict=True)) if found else NOTHING, refused
+    for k, (job, place) in enumerate(zip(jobs, told, strict=True)):
+        known, id, row = objects[job.object], columns.patterns[place], job.place
+        pattern = known.complete.patterns.get(id) or known.patterns.get(id)
+        nonzeros, seconds = columns.nonzeros[place], columns.seconds[place]
+        good = lent and known.epoch == epochs[row] and 0 <= seconds < math.inf and nonzeros * item <= rooms[row]
+        if good and pattern is not None and pattern.nonzeros == nonzeros:
+            found.append((k, place, row, known, pattern))
+        else:
+            refused.append((k, _why(decoder, columns, place, job, pattern)))
+    return Expected(batch, *map(list, zip(*found, strict=True))) if found else Expected(
+        batch, [], [], [], [], []
+    ), refused
+
+
+def _why(
+    decoder: FactorDecoder, columns: AnswerColumns, place: int, job: InFlightJob, pattern: FactorPattern | None
+) -> Refused:  # fmt: skip
+    """Returns what is wrong with an answer."""
+    try:
+        if not 0 <= (seconds := columns.seconds[place]) < math.inf:
+            raise Refused(f"FactorBatch.seconds has {seconds}; allowed: finite, 0 or more", "malformed")
+        decoder.known(job)
+        if pattern is None:
+            raise Refused(f"FactorBatch.patterns has {columns.patterns[place]:016x}, which was not sent", "pattern")
+        if (nonzeros := columns.nonzeros[place]) != pattern.nonzeros:
+            raise Refused(f"FactorBatch.nonzeros has {nonzeros}; allowed: {pattern.nonzeros}", "shape")
+        check_slot(columns.slot, nonzeros, job)
+    except Refused as refusal:
+        return refusal
+    return Refused(f"FactorBatch.jobs has {job.number}, whose object or slot changed meanwhile", "epoch")
 
 
 def _taken(decoder: FactorDecoder, found: Expected, sent: SentMatrices | None) -> TakenIn:
-    """Copies values of factors, which are of one type, out of the slot that was lent for their jobs."""
-    slot, dtype = slot_of(found.jobs[0]), np.dtype(found.jobs[0].dtype)
+    """Copies values of factors out of the slot that was lent for their jobs."""
+    slot, dtype = found.batch.factor_slot, np.dtype(found.batch.dtype)
+    assert slot is not None
     total = sum(pattern.nonzeros for pattern in found.patterns)
     memory: NDArray[Any]
     if total * dtype.itemsize > LARGE:
         memory = decoder.memory(1 << (total - 1).bit_length(), dtype)  # of few sizes, so that it is used again
     else:
         memory = np.empty(total, dtype)
-    begin = np.array([job.first for job in found.jobs], np.int64)
-    return take_in(Parts(slot.part(0, np.uint8, slot.capacity), begin), found.patterns, memory[:total], sent)
+    source = Parts(slot.part(0, np.uint8, slot.capacity), found.batch.first[found.places])
+    return take_in(source, found.patterns, memory[:total], sent)
 
 
 def _wrong(columns: AnswerColumns, found: Expected, taken: TakenIn) -> dict[int, Refused]:
     """Returns why some of the factors that were copied are refused, by their rows."""
-    told = np.array([columns.checksums[place] for place in found.told], np.uint64)
+    told = columns.checksums[found.told]
     looked, refused = taken.found, dict[int, Refused]()
     good = (looked["checksum"] == told) & (looked["finite"] != 0) & (looked["positive"] != 0)
     for row in np.flatnonzero(~good).tolist():
@@ -148,17 +191,15 @@ def _wrong(columns: AnswerColumns, found: Expected, taken: TakenIn) -> dict[int,
 
 
 def _together(
-    columns: AnswerColumns, found: Expected, taken: TakenIn, rows: Sequence[int], sent: SentMatrices | None
+    columns: AnswerColumns, found: Expected, taken: TakenIn, sent: SentMatrices | None
 ) -> tuple[list[int], FactorsTogether]:  # fmt: skip
-    """Returns some of the factors that were found, of one pattern and method, and their places among the answers."""
-    all_of_them = len(rows) == len(found.jobs)
-    jobs, told = [found.jobs[row] for row in rows], [found.told[row] for row in rows]
-    own = taken if all_of_them else taken.of(rows)
+    """Returns factors of one pattern, and their places among the answers."""
+    batch, told = found.batch, found.told
     factors = FactorsTogether(
-        found.patterns[rows[0]], jobs[0].worker, jobs[0].method, [job.object for job in jobs],
-        [job.epoch for job in jobs], [job.step for job in jobs], [job.warp for job in jobs], own.values,
-        [columns.seconds[k] for k in told], [columns.remedies[k][:200] for k in told],
+        found.patterns[0], batch.worker, batch.method, found.of_batch(batch.objects), found.of_batch(batch.epochs),
+        found.of_batch(batch.steps), found.of_batch(batch.warps), taken.values, [columns.seconds[k] for k in told],
+        [columns.remedies[k][:200] for k in told], bodies=found.bodies,
     )  # fmt: skip
     if sent is not None:
-        sent.end(factors, own)
-    return [found.answers[row] for row in rows], factors
+        sent.end(factors, taken)
+    return found.answers, factors

@@ -88,7 +88,6 @@ class Dispatch(FactorSource):
             "worker": self._on_heartbeat,
             "pattern": self._on_pattern,
             "factor": self._intake.on_factor,
-            "factors": self._intake.on_factors,
             "alive_worker": self._on_token,
         }
 
@@ -99,7 +98,7 @@ class Dispatch(FactorSource):
 
     def wake_by(self, wake: Callable[[], None]) -> None:
         """Has `wake` called, in another thread, when a factor that is taken in beside the caller is there."""
-        self._intake.wake = wake
+        self._intake.wake_by(wake)
 
     def makes_slots(self) -> bool:
         """True while shared memory for arrays is being made beside the caller."""
@@ -184,15 +183,13 @@ class Dispatch(FactorSource):
         """Returns the factors that arrived and passed all checks since the last call."""
         with self._lock:
             together = self.poll_together()
-            factors, self._intake.factors = self._intake.factors, []
-            return [*factors, *(factor for each in together for factor in each)]
+            return [*self._intake.alone(), *(factor for each in together for factor in each)]
 
     def poll_together(self) -> list[FactorsTogether]:
         """Returns those of messages of several; the next `poll` returns the others."""
         with self._lock:
             self._receive()
-            together, self._intake.together = self._intake.together, []
-            return together
+            return self._intake.together()
 
     def patterns(self) -> list[tuple[str, FactorPattern]]:
         """Returns (object, pattern) of the patterns that came since the last call; each comes before its factors."""
@@ -213,7 +210,7 @@ class Dispatch(FactorSource):
 
     def check_with(self, begin: BeginCheck) -> None:
         """Has factors of messages checked in the thread that copies them."""
-        self._intake.begin_check = begin
+        self._intake.batches.begin_check = begin
 
     def worker_count(self) -> int:
         """Number of workers that may be given jobs, idle or busy."""
@@ -275,6 +272,7 @@ class Dispatch(FactorSource):
         """Takes in all messages that arrived, refuses malformed ones, and ends leases. Once in a `round`."""
         if self._received:
             return
+        batches = self._intake.batches.done  # whose patterns came before them, and are read now
         for channel, sample in self._inbox:
             try:
                 self._on_message[channel](sample)
@@ -283,7 +281,7 @@ class Dispatch(FactorSource):
             except Exception as error:  # whatever a message holds, the run goes on
                 self._counters.refuse(self._counters.unexpected(error, f"a message {str(sample.key_expr)[:200]!r}"))
         try:
-            self._intake.take_decoded()
+            self._intake.take_decoded(batches)
         except Exception as error:
             self._counters.refuse(self._counters.unexpected(error, "factors taken in beside the caller"))
         self._sender.give_back_sent()
@@ -335,6 +333,8 @@ class Dispatch(FactorSource):
                 self._counters.warn("worker_copies", f"worker {name} has no shared memory with us, arrays are copied")
 
     def _remove_worker(self, name: str) -> None:
+        if self.leases.count(name):
+            self._intake.batches.finish()  # it may have answered before it left
         self._sender.forget_link(name)
         self._counters.add("jobs_lost", self._book.remove_worker(name))
 

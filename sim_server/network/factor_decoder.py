@@ -240,17 +240,17 @@ class FactorDecoder:
         seconds: float, remedy: str,
     ) -> Factor:  # fmt: skip
         """Returns the factor of values that were checked."""
-        self.note_size(known, pattern, job)
+        self.note_size(known, pattern, job.object, job.method)
         return Factor(job.object, job.epoch, job.step, job.warp, pattern, values, job.worker, seconds, remedy[:200])
 
-    def note_size(self, known: AnnouncedObject, pattern: FactorPattern, job: InFlightJob) -> None:
+    def note_size(self, known: AnnouncedObject, pattern: FactorPattern, object: str, method: str) -> None:
         """Takes note of the pattern of a factor that was checked."""
-        if job.object in self._unsized:
-            self._unsized.discard(job.object)
-        if job.method != COMPLETE:
-            sizes = known.sizes.get(job.method, {})
+        if object in self._unsized:
+            self._unsized.discard(object)
+        if method != COMPLETE:
+            sizes = known.sizes.get(method, {})
             if pattern.id not in sizes:
-                known.sizes[job.method] = _with_last(sizes, pattern.id, pattern.nonzeros)
+                known.sizes[method] = _with_last(sizes, pattern.id, pattern.nonzeros)
         elif pattern.id not in known.complete.sizes:
             self._share(known.complete, pattern)
 
@@ -285,7 +285,7 @@ class FactorDecoder:
         Returns them, their checksum, and whether all are finite."""
         size = check_slot((told.segment, told.offset, told.generation), nonzeros, job)
         values = (self.memory if size > LARGE else np.empty)(nonzeros, np.dtype(job.dtype))
-        return values, copied(slot_of(job).part(job.first, job.dtype, nonzeros), values, own=values)
+        return values, copied(_slot(job).part(job.first, job.dtype, nonzeros), values, own=values)
 
     def _from_device(self, told: DeviceSlotMessage, pattern: FactorPattern, job: InFlightJob) -> Float32 | Float64:
         """Returns a copy of the values in the slot of device memory that was lent for the job, which are checked."""
@@ -316,8 +316,7 @@ def _with_last(entries: dict[int, T], id: int, value: T) -> dict[int, T]:
     return {**dict(others[1 - MAX_PATTERNS :]), id: value}
 
 
-def slot_of(job: InFlightJob) -> Slot:
-    """Returns the slot that was lent for the factor of a job."""
+def _slot(job: InFlightJob) -> Slot:
     assert job.factor_slot is not None
     return job.factor_slot
 

@@ -13,7 +13,7 @@ from protocol.refused import Refused
 
 # Messages that may wait in each channel; beyond that the oldest is lost. Channels are read in this order, and tokens
 # after them: a worker may send a factor and then leave.
-RINGS = {"worker": 1024, "pattern": MOST_JOBS, "factor": MOST_JOBS, "factors": 64}
+RINGS = {"worker": 1024, "pattern": MOST_JOBS, "factor": MOST_JOBS}
 TOKENS = 4096
 
 
@@ -50,9 +50,6 @@ class Inbox:
 
     def _read(self, channel: str) -> Iterator[tuple[str, zenoh.Sample]]:
         while (sample := self._rings[channel].try_recv()) is not None:
-            if channel in (
-                "factor",
-                "factors",
-            ):  # its pattern is sent just before it and may have arrived after patterns were read
+            if channel == "factor":  # its pattern is sent just before it and may have arrived after patterns were read
                 yield from self._read("pattern")
             yield channel, sample

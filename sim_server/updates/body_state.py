@@ -123,11 +123,11 @@ class FailureState:
     reported: causes that the log has
     """
 
-    in_a_row, refused = Cell("failures"), Cell()
+    in_a_row, refused, assemblies = Cell("failures"), Cell(), Cell()
 
     def __init__(self, table: UpdateTable, index: int):
         self._table, self._index = table, index
-        self.assemblies, self.reason = 0, ""
+        self.reason = ""
         self.reported: set[str] = set()
 
 
@@ -139,20 +139,18 @@ class FactorStatistics:
     kept: the newest one, under policies by which a run repeats
     latency: steps from a matrix to its factor
     cost, cost_by_method: of a factorization [s, or operations]
-    methods, workers: of the last jobs, and of the last factors, by step
+    methods: of the last jobs by step, where methods are chosen
     """
 
-    newest, used = Cell(), Cell()
+    newest, used, regularized = Cell(), Cell(), Cell()
 
     def __init__(self, table: UpdateTable, index: int):
         self._table, self._index = table, index
-        self.regularized = 0
         self.kept: Factor | None = None
         self._dropped: tuple[int, int] | None = None
         self.latency, self.cost = MeanCell(table.latency, index), MeanCell(table.cost, index)
         self.cost_by_method: dict[str, RunningMean] = {}
         self.methods: dict[int, Method] = {}
-        self.workers: dict[int, str] = {}
 
     @property
     def dropped(self) -> tuple[int, int] | None:
@@ -173,7 +171,12 @@ class FactorStatistics:
 
     def worker(self, step: int) -> str:
         """Returns who made the factor of a step; empty if that is not remembered."""
-        return self.workers.get(step, "")
+        return self._table.makers.worker(self._index, step)
+
+    @property
+    def workers(self) -> dict[int, str]:
+        """Who made the last factors, by step."""
+        return self._table.makers.of(self._index)
 
     def method_cost(self, method: Method) -> float:
         """Returns the mean cost of a factorization by a method [s, or operations]; 0 if there was none."""
@@ -185,16 +188,16 @@ class FactorStatistics:
         self.cost.add(cost)
         self.newest = factor.step
         self.used += 1
-        self.note(factor.step, factor.worker, cost, bool(factor.remedy))
+        self.regularized += bool(factor.remedy)
+        self._table.makers.note(np.array([self._index]), np.array([factor.step]), [factor.worker])
+        self.note_method(factor.step, cost)
 
-    def note(self, step: int, worker: str, cost: float, regularized: bool) -> None:
-        """Remembers of a factor what stands in no table."""
+    def note_method(self, step: int, cost: float) -> None:
+        """Remembers what a factor has cost by the method of its job."""
         if (method := self.methods.get(step)) is not None:
             if (mean := self.cost_by_method.get(method.name)) is None:
                 mean = self.cost_by_method[method.name] = RunningMean()
             mean.add(cost)
-        _remember(self.workers, step, worker)
-        self.regularized += regularized
 
 
 class BodyUpdateState:
@@ -351,20 +354,22 @@ class MadeFactors(NamedTuple):
         return cls([factor.step for factor in factors], [factor.seconds for factor in factors], workers, regularized)
 
 
-def on_factors(states: Sequence[BodyUpdateState], table: UpdateTable, made: MadeFactors, step: int) -> list[bool]:
+def on_factors(states: Sequence[BodyUpdateState], bodies: Int64, made: MadeFactors, step: int) -> list[bool]:
     """Takes note of factors of different bodies, as BodyUpdateState.on_factor does of each, with costs in seconds.
+    Returns of each whether it is newer than that of its body.
 
-    table: that of the states. step: during which they came
+    states: of all bodies of one table. step: during which they came
     """
-    costs, bodies = [max(each, MIN_SECONDS) for each in made.seconds], [state._index for state in states]
-    newer = table.on_factors(np.array(bodies, np.int64), np.array(made.steps, np.int64), np.array(costs), step)
-    noted = zip(states, made.steps, made.workers, costs, made.regularized, newer, strict=True)
-    for state, own, worker, cost, regularized, better in noted:
-        if state.job.positions:
-            state.failures.assemblies = 0
-        if better:
-            state.factors.note(own, worker, cost, regularized)
-    return newer
+    table, steps, costs = states[0]._table, np.array(made.steps, np.int64), np.maximum(made.seconds, MIN_SECONDS)
+    newer = np.array(table.on_factors(bodies, steps, costs, step), np.bool_)
+    table.assemblies[bodies[table.positions[bodies]]] = 0
+    own, places = bodies[newer], np.flatnonzero(newer).tolist()
+    table.makers.note(own, steps[newer], [made.workers[k] for k in places])
+    table.regularized[own] += np.array(made.regularized, np.int64)[newer]
+    if states[0].tuner is not None:
+        for k in places:
+            states[bodies[k]].factors.note_method(made.steps[k], float(costs[k]))
+    return list(newer.tolist())
 
 
 def _remember(table: dict[int, Any], step: int, value: Any) -> None:

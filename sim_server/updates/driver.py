@@ -403,7 +403,8 @@ class Driver:
         states, step = [self.by_name[factor.object] for factor in factors], self.engine.step
         if self.counted or len(factors) < MANY or len({factor.object for factor in factors}) < len(factors):
             return [state.on_factor(factor, step) for state, factor in zip(states, factors, strict=True)]
-        return on_factors(states, self.table, MadeFactors.of(factors), step)
+        rows = np.array([state.body.index for state in states], np.int64)
+        return on_factors(self.bodies, rows, MadeFactors.of(factors), step)
 
     def tell(self, state: BodyUpdateState, factor: Factor) -> None:
         """Tells observers, and `auto`, of a factor that the loop was given."""

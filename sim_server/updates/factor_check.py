@@ -95,7 +95,8 @@ class FactorCheck:
             return reasons
         found = self._judged([checked[k] for k in fitting], applied)
         for k in np.flatnonzero(self._may_be_useless(found)).tolist():
-            reasons[fitting[k]] = self._useless(*checked[fitting[k]], Probe(*found[k].tolist()))
+            factor, matrix = checked[fitting[k]]
+            reasons[fitting[k]] = self._useless(factor, matrix is not None, Probe(*found[k].tolist()))
         return reasons
 
     def bodies(
@@ -121,13 +122,17 @@ class FactorCheck:
         if bodies is None:
             return self.reject_reasons(list(zip(factors, matrices, strict=True)))
         judged = self._judge(Checked(bodies, factors.values, matrices), WITH_FACTOR | WITH_BLOCK_JACOBI)
-        return self.reasons(factors, matrices, judged)
+        return self.reasons(factors, judged, matrices)
 
-    def reasons(self, factors: FactorsTogether, matrices: Sequence[Reals | None], judged: Reals) -> list[str]:
-        """Returns why each of some factors is not to be used; empty if it is. judged: of each, as of wf_judge_all"""
+    def reasons(
+        self, factors: FactorsTogether, judged: Reals, matrices: Sequence[Reals | None] | None = None
+    ) -> list[str]:  # fmt: skip
+        """Returns why each of some factors is not to be used; empty if it is. judged: of each, as of wf_judge_all.
+        matrices: that they were made from; None: all are known"""
         found, reasons = _probes(judged), [""] * len(factors)
         for k in np.flatnonzero(self._may_be_useless(found)).tolist():
-            reasons[k] = self._useless(factors[k], matrices[k], Probe(*found[k].tolist()))
+            known = matrices is None or matrices[k] is not None
+            reasons[k] = self._useless(factors[k], known, Probe(*found[k].tolist()))
         return reasons
 
     def wrong_size(self, factor: Factor) -> str:
@@ -149,17 +154,18 @@ class FactorCheck:
         useless: NDArray[np.bool_] = ~(positive & better & exact if self._alone else positive & better)
         return useless
 
-    def _useless(self, factor: Factor, matrix: Reals | None, probe: Probe) -> str:
+    def _useless(self, factor: Factor, known: bool, probe: Probe) -> str:
+        """known: its matrix is"""
         zr, reduction, block_jacobi, residual = probe
         positive, better, exact = _within_limits(*probe)
         if not positive:
             return f"not positive definite or not finite (z.r = {zr:.3g} on a probe vector)"
-        if matrix is not None and not better:
+        if known and not better:
             return (
                 "worse than block Jacobi on a probe vector: an iteration takes "
                 f"{reduction:.3g} off the energy of the error, with block Jacobi {block_jacobi:.3g}"
             )
-        if self._alone and matrix is not None and not factor.remedy and not exact:
+        if self._alone and known and not factor.remedy and not exact:
             return (
                 f"not that of its matrix: it leaves {residual:.3g} of a residual, at most {MAX_RESIDUAL:g} is allowed"
             )

@@ -38,9 +38,9 @@ class SentMatrices(NamedTuple):
     end: Callable[[FactorsTogether, "TakenIn"], None]
 
 
-BeginCheck = Callable[[Sequence[str], Sequence[int], Sequence[int], Sequence[FactorPattern]], SentMatrices | None]
-"""Returns what factors are checked with: of objects, epochs and steps, each with its pattern; None: they are checked
-later. From any thread."""
+BeginCheck = Callable[[Sequence[str], Sequence[int], Sequence[FactorPattern], Sequence[Float64]], SentMatrices | None]
+"""Returns what factors are checked with: of objects and their epochs, each with its pattern and the matrix that was
+sent; None: they are checked later. From any thread."""
 
 
 class TakenIn(NamedTuple):
@@ -55,6 +55,8 @@ class TakenIn(NamedTuple):
 
     def of(self, chosen: Sequence[int]) -> "TakenIn":
         """Returns some of them."""
+        if len(chosen) == len(self.values):
+            return self
         return TakenIn([self.values[k] for k in chosen], self.found[list(chosen)])
 
 

@@ -16,6 +16,7 @@ from protocol.shared_memory.located import address
 from sim_server.arrays import Float64, Int64
 from sim_server.backends.compiler import native
 from sim_server.backends.declarations import Declarations
+from sim_server.updates.makers import Makers
 from sim_server.updates.stats import updated
 
 SOURCE = "updates/update_table.cpp"
@@ -110,8 +111,9 @@ class UpdateTable:
     """A row for each body. Means are NaN while they are not known, steps NONE.
 
     excess, latest, lost, factor_step, max_factor_age, iteration_cost, first_excess: as in SolveStatistics
-    refused, failures: as `refused`, `in_a_row` in FailureState
-    newest, latency, cost, used: as in FactorStatistics; dropped: the newest factor is useless
+    refused, failures, assemblies: as `refused`, `in_a_row`, `assemblies` in FailureState
+    newest, latency, cost, used, regularized: as in FactorStatistics; dropped: the newest factor is useless
+    makers: of the last factors
     sent, in_flight, checked, excess_sent, request, requested, extrapolated, positions: as in JobState
     copying: a copy is requested, or waits to be sent
     copies, matrices: as in JobState, lists; matrix_steps: of these matrices
@@ -137,6 +139,8 @@ class UpdateTable:
         self.iteration_cost, self.latency, self.cost = unknown(), unknown(), unknown()
         self.first_excess = unknown()
         self.refused, self.failures, self.used = (np.zeros(bodies, np.int64) for _ in range(3))
+        self.assemblies, self.regularized = (np.zeros(bodies, np.int64) for _ in range(2))
+        self.makers = Makers(bodies)
         self.error_bound = np.full(bodies, np.inf)
         self.dropped, self.in_flight, self.copying, self.frozen = (np.zeros(bodies, np.bool_) for _ in range(4))
         self._columns = Table(bodies=bodies)

@@ -7,73 +7,25 @@ from typing import Any
 import numpy as np
 import pytest
 
-from precond_worker.factorization.factorize import Analysis
-from protocol.channels import PROTOCOL, key
+from protocol.channels import PROTOCOL
 from protocol.factor import Factor
-from protocol.messages_pb2 import FactorBatch, Header, Topology
-from protocol.messages_pb2 import Slot as SlotMessage
+from protocol.messages_pb2 import Header, Topology
 from protocol.refused import Refused
 from protocol.validate import checksum
 from sim_server.network import batch_decoder as module
-from sim_server.network.factor_decoder import FactorDecoder
-from tests.support.in_flight import in_flight
-from tests.worker.block_matrices import bar_edges, pattern, spd
-
-GRAPHS = [pattern(12, bar_edges(1, 1, 2)), pattern(8, bar_edges(1, 1, 1))]
-MADE = [Analysis(*graph) for graph in GRAPHS]
-KINDS = {"a": 0, "b": 0, "c": 1, "d": 0, "e": 0}  # of the objects
-ROOM = 1 << 14  # bytes
-
-
-class Memory:
-    """A slot of shared memory. bytes: of it"""
-
-    segment, offset = "7.zenoh", 64
-
-    def __init__(self) -> None:
-        self.bytes = np.zeros(len(KINDS) * ROOM, np.uint8)
-        self.capacity = self.bytes.nbytes
-
-    def part(self, first: int, dtype: Any, count: int) -> np.ndarray:
-        return self.bytes[first : first + count * np.dtype(dtype).itemsize].view(dtype)
+from tests.support.answered_batch import GRAPHS, KINDS, MADE, ROOM, answered
 
 
 @pytest.fixture
 def stage() -> SimpleNamespace:
-    """decoder, slot, message, answers (place and job of each object), and values by object."""
-    decoder, slot = FactorDecoder(7), Memory()
-    message = FactorBatch(
-        header=Header(protocol=PROTOCOL, incarnation=7), worker="w",
-        slot=SlotMessage(segment=slot.segment, offset=slot.offset, capacity=slot.capacity, generation=3),
-    )  # fmt: skip
-    answers, values = [], {}
-    for place, (name, kind) in enumerate(KINDS.items()):
-        (row_start, columns), made = GRAPHS[kind], MADE[kind]
-        header = Header(protocol=PROTOCOL, incarnation=7, object=name, epoch=1)
-        decoder.announce(
-            Topology(header=header, nodes=len(row_start) - 1, row_start=row_start.tobytes(), columns=columns.tobytes())
-        )
-        decoder.add_pattern(key("pattern", worker="w", object=name), made.pattern.message(header).SerializeToString())
-        values[name] = made.factorize(spd(*GRAPHS[kind], seed=place), np.float32)
-        slot.part(place * ROOM, np.float32, len(values[name]))[:] = values[name]
-        job = in_flight(
-            place + 1, name, 1, 5, "float32", "w", 9.0, factor_slot=slot, factor_generation=3,
-            first=np.array([place * ROOM]), rooms=np.array([ROOM]),
-        )  # fmt: skip
-        answers.append((place, job))
-        message.jobs.append(job.number)
-        message.patterns.append(made.pattern.id)
-        message.nonzeros.append(len(values[name]))
-        message.checksums.append(checksum(values[name]))
-        message.seconds.append(0.25)
-    return SimpleNamespace(decoder=decoder, slot=slot, message=message, answers=answers, values=values)
+    return answered()
 
 
 def refused(stage: SimpleNamespace) -> dict[str, str]:
     """Kinds of refusals by object; the others must have their own values."""
     kinds = {}
     found = decoded(stage)
-    for (_, job), each in zip(stage.answers, found, strict=True):
+    for job, each in zip(stage.batch.jobs, found, strict=True):
         if isinstance(each, Refused):
             kinds[job.object] = each.kind
         else:
@@ -85,12 +37,12 @@ def refused(stage: SimpleNamespace) -> dict[str, str]:
 
 def decoded(stage: SimpleNamespace) -> list[Factor | Refused]:
     """The factor of each answer, or why it is refused."""
-    good, refused = module.decode_several(stage.decoder, stage.message, stage.answers)
+    good, refused = module.decode_several(stage.decoder, stage.message, stage.batch.jobs, range(len(KINDS)))
     found = dict(refused)
     for places, factors in good:
         assert len(places) == len(factors) and not found.keys() & set(places)
         found |= dict(zip(places, factors, strict=True))
-    return [found[k] for k in range(len(stage.answers))]
+    return [found[k] for k in range(len(KINDS))]
 
 
 def test_they_are_copied_one_behind_the_other_into_memory_of_few_sizes(stage, monkeypatch):
@@ -137,11 +89,26 @@ def test_a_value_that_no_factor_has_costs_the_others_nothing(stage, number, kind
 
 
 def test_one_that_has_no_room_of_its_own_is_refused_alone(stage):
-    stage.answers[1][1].batch.rooms[0] = 64
+    stage.batch.rooms[1] = 64
     assert refused(stage) == {"b": "slot"}
-    stage.answers[3][1].batch.factor_generation = 4
-    stage.answers[4][1].batch.factor_slot = None
-    assert refused(stage) == {"b": "slot", "d": "slot", "e": "slot"}
+
+
+@pytest.mark.parametrize("slot", ["none", "another"])
+def test_those_of_a_slot_that_was_not_lent_are_refused(stage, slot):
+    if slot == "none":
+        stage.batch.factor_slot = None
+    else:
+        stage.batch.factor_generation = 4
+    assert refused(stage) == dict.fromkeys(KINDS, "slot")
+
+
+def test_answers_may_come_in_any_order_and_some_of_them_alone(stage):
+    jobs = [stage.batch.jobs[k] for k in (3, 1, 4)]
+    good, refused = module.decode_several(stage.decoder, stage.message, jobs, [3, 1, 4])
+    assert refused == [] and [factors.objects for _, factors in good] == [["d", "b", "e"]]
+    assert [places for places, _ in good] == [[0, 1, 2]]
+    for factors in good[0][1]:
+        np.testing.assert_array_equal(factors.values, stage.values[factors.object])
 
 
 def test_of_an_object_that_was_split_meanwhile_nothing_is_taken(stage):

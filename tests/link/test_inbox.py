@@ -33,8 +33,8 @@ def inbox(**rings: Ring) -> Inbox:
 
 
 def test_factors_are_taken_before_the_leaving_of_their_worker() -> None:
-    found = list(inbox(worker=Ring("w"), pattern=Ring("p"), factor=Ring("f"), factors=Ring("m"), alive=Ring("gone")))
-    assert found == [("worker", "w"), ("pattern", "p"), ("factor", "f"), ("factors", "m"), ("alive_worker", "gone")]
+    found = list(inbox(worker=Ring("w"), pattern=Ring("p"), factor=Ring("f"), alive=Ring("gone")))
+    assert found == [("worker", "w"), ("pattern", "p"), ("factor", "f"), ("alive_worker", "gone")]
 
 
 def test_a_pattern_that_comes_while_factors_are_taken_is_not_late() -> None:
@@ -46,5 +46,5 @@ def test_a_pattern_that_comes_while_factors_are_taken_is_not_late() -> None:
             patterns.samples.append("of the second")
 
     factors = Ring("first", "second", looked=arrive)
-    found = list(inbox(worker=Ring(), pattern=patterns, factor=factors, factors=Ring(), alive=Ring()))
+    found = list(inbox(worker=Ring(), pattern=patterns, factor=factors, alive=Ring()))
     assert found == [("factor", "first"), ("pattern", "of the second"), ("factor", "second")]

@@ -19,7 +19,7 @@ from protocol.messages_pb2 import FactorBatch, MatrixBatch
 from protocol.shared_memory.limits import obstacle
 from protocol.shared_memory.view import SlotMap
 from protocol.validate import checksum
-from sim_server.network import batch_decoder, factor_intake, job_sender, worker_choice
+from sim_server.network import batch_decoder, batch_intake, job_sender, worker_choice
 from sim_server.network.batch_message import MOST_TOGETHER
 from sim_server.network.job_sender import JobSender
 from sim_server.network.link import ServerLink
@@ -282,15 +282,10 @@ def test_what_is_wrong_with_one_costs_the_others_nothing(stage: Hand, name: str)
     assert stage.driver.link.counters.refusals[kind] == before + 1 and stage.driver.link.slots_lent == 0
 
 
-@pytest.mark.parametrize("beside", [False, True], ids=["at once", "in a thread"])
-def test_an_error_that_no_check_foresees_costs_its_message_alone(
-    stage: Hand, beside: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_error_that_no_check_foresees_costs_its_message_alone(stage: Hand, monkeypatch: pytest.MonkeyPatch) -> None:
     def broken(*arguments: Any) -> None:
         raise IndexError("index 7 is out of bounds")
 
-    if beside:
-        monkeypatch.setattr(factor_intake, "LARGE_MESSAGE", 0)
     batch, refusals = stage.batch(), stage.driver.link.counters.refusals["unexpected"]
     monkeypatch.setattr(batch_decoder, "take_in", broken)
     stage.send(stage.answer(batch, [0, 2]))
@@ -304,15 +299,12 @@ def test_an_error_that_no_check_foresees_costs_its_message_alone(
     assert stage.made() == {"b", "d"} and stage.driver.link.slots_lent == 0
 
 
-@pytest.mark.parametrize("beside", [False, True], ids=["at once", "in a thread"])
 def test_factors_are_used_and_their_jobs_over_though_taking_note_of_them_fails(
-    stage: Hand, beside: bool, monkeypatch: pytest.MonkeyPatch
+    stage: Hand, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def broken(*arguments: Any) -> None:
         raise IndexError("index 7 is out of bounds")
 
-    if beside:
-        monkeypatch.setattr(factor_intake, "LARGE_MESSAGE", 0)
     batch, refusals = stage.batch(), stage.driver.link.counters.refusals["unexpected"]
     monkeypatch.setattr(WorkerTiming, "record_all", broken)
     stage.send(stage.answer(batch))
@@ -378,17 +370,15 @@ def test_large_batches_are_checked_where_they_are_decoded(
     stage: Hand, monkeypatch: pytest.MonkeyPatch, known: bool
 ) -> None:
     """By what the driver gives for just these jobs, if it gives anything."""
-    monkeypatch.setattr(factor_intake, "LARGE_MESSAGE", 0)
     check = FactorCheck(
         {n: (np.frombuffer(b.row_start, np.int32), np.frombuffer(b.columns, np.int32)) for n, b in BEAMS.items()}
     )
     residuals: dict[str, float] = {}
 
-    def begin(objects: Any, epochs: Any, steps: Any, patterns: Any) -> SentMatrices | None:
-        assert set(epochs) == {1} and set(steps) == {stage.step}
+    def begin(objects: Any, epochs: Any, patterns: Any, matrices: Any) -> SentMatrices | None:
+        assert set(epochs) == {1}
         bodies = check.bodies(objects, epochs, patterns)
         assert bodies is not None
-        matrices = [matrix(BEAMS[name], shift(name, stage.step)) for name in objects]
         return SentMatrices(bodies, matrices, 0, end) if known else None
 
     def end(factors: Any, taken: Any) -> None:
@@ -411,31 +401,31 @@ def test_large_batches_are_checked_where_they_are_decoded(
     stage.check_factors()
 
 
-def test_large_batches_are_decoded_beside_the_caller(stage: Hand, monkeypatch: pytest.MonkeyPatch) -> None:
-    """All count as large here. Meanwhile nothing is taken and second answers are refused; then each counts alone."""
-    monkeypatch.setattr(factor_intake, "LARGE_MESSAGE", 0)
+def test_batches_are_decoded_beside_the_caller(stage: Hand, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Meanwhile nothing is taken; then each counts alone, and second answers are refused."""
     dispatch = stage.driver.link.dispatch
     free = dispatch.ready()
     batch, go = stage.batch(), threading.Event()
     assert dispatch.ready() == free - len(NAMES)
-    decode, before = factor_intake.decode_several, stage.driver.link.counters.refusals["duplicate"]
+    decode, before = batch_intake.decode_several, stage.driver.link.counters.refusals["duplicate"]
 
     def slow(*arguments: Any) -> Any:
         assert go.wait(30)
         return decode(*arguments)
 
-    monkeypatch.setattr(factor_intake, "decode_several", slow)
+    monkeypatch.setattr(batch_intake, "decode_several", slow)
     message = stage.answer(batch, [0, 1, 1, 2, 3])
     message.checksums[3] = 7
     stage.send(message)
     stage.send(stage.answer(batch, [0]))
-    stage.driver.until(lambda: stage.driver.link.counters.refusals["duplicate"] == before + 2, "the second answers")
+    stage.driver.until(lambda: dispatch.decoding == len(NAMES), "the begin")
     assert not stage.driver.factors and stage.driver.link.slots_lent == 2
     assert dispatch.ready() == free, "its worker has done them"
     go.set()
     stage.driver.until(lambda: all_are_back(stage), "the factors")
     stage.check_factors()
     assert stage.made() == {"a", "b", "d"} and stage.failed() == {"c"} and stage.driver.link.slots_lent == 0
+    stage.driver.until(lambda: stage.driver.link.counters.refusals["duplicate"] == before + 2, "the second answers")
 
 
 def test_what_waits_behind_a_first_job_has_longer(stage: Hand) -> None:

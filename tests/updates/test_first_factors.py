@@ -132,28 +132,6 @@ def test_a_job_that_is_still_read_after_the_time_out_is_of_the_first_matrix() ->
     assert not np.array_equal(driver.engine.factor_matrix(1), before), "or it shows nothing"
 
 
-def test_a_check_that_lasts_longer_than_the_time_out_is_of_the_first_matrix(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Factors of messages are checked in a thread of their own, with what was sent."""
-    sim = simulation(*BODIES, gravity=GRAVITY, preconditioner="cholesky")
-    workers, begun = Workers(sim), []
-    monkeypatch.setattr(workers, "check_with", begun.append, raising=False)
-    driver, workers.held = Driver(sim, workers), True
-    time, checks = Time(), []
-
-    def sleep(seconds: float) -> None:
-        if workers.jobs and not checks:
-            (factor,) = workers._done
-            checks.append(begun[0](["b"], [1], [0], [factor.pattern]))
-        time.sleep(seconds)
-
-    assert FirstFactors(driver, time.clock, sleep).run()
-    (job,) = workers.jobs
-    before = job.values.copy()
-    driver.advance(3)
-    assert np.array_equal(checks[0].matrices, [before])
-    assert not np.array_equal(driver.engine.factor_matrix(1), before), "or it shows nothing"
-
-
 def test_without_a_worker_the_wait_is_short() -> None:
     sim = simulation(*BODIES, preconditioner="cholesky")
     first, time = first_factors(Driver(sim, Workers(sim, count=0)))

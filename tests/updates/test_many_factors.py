@@ -111,14 +111,15 @@ def checked(driver: Driver) -> None:
         driver.receive(driver.source, driver.policy.on_factors)
 
 
-def begun(source: Messages, factors: FactorsTogether) -> SentMatrices | None:
+def begun(driver: Driver, factors: FactorsTogether) -> SentMatrices | None:
     """What they would be checked with as they come."""
-    return source.begin_check(factors.objects, factors.epochs, factors.steps, [factors.pattern] * len(factors))
+    matrices = [driver.by_name[name].job.matrix[1] for name in factors.objects]
+    return driver.source.begin_check(factors.objects, factors.epochs, [factors.pattern] * len(factors), matrices)
 
 
-def checked_as_they_come(source: Messages, factors: FactorsTogether) -> FactorsTogether:
+def checked_as_they_come(driver: Driver, factors: FactorsTogether) -> FactorsTogether:
     """As the thread that copies them does."""
-    sent = begun(source, factors)
+    sent = begun(driver, factors)
     slot, size = np.concatenate(factors.values), factors.values[0].nbytes
     begin = size * np.arange(len(factors))
     taken = take_in(Parts(slot, begin), [factors.pattern] * len(factors), np.empty_like(slot), sent)
@@ -149,7 +150,7 @@ def test_together_they_are_used_or_refused_as_if_each_came_alone(bad, early):
     (one, alone), (many, together) = start(), start()
     alone.alone = list(spoilt(made(one), bad))
     factors = spoilt(made(many), bad)
-    together.together = [checked_as_they_come(together, factors) if early else factors]
+    together.together = [checked_as_they_come(many, factors) if early else factors]
     checked(one), checked(many)
     assert told(one) == told(many) and alone.blamed == together.blamed == [f"bar{k}" for k in bad]
     steps = [one.engine.run(1) and one.engine.records()["factor_step"].tolist()[-BODIES:] for _ in range(2)]
@@ -195,7 +196,7 @@ def test_those_that_wait_for_a_check_and_those_of_bodies_that_move_no_more_are_t
 def test_those_that_were_checked_as_they_came_are_used_at_once_however_few():
     driver, source = start()
     memory = driver.bodies[0].job.matrix[1]
-    source.together = [checked_as_they_come(source, made(driver).of([0, 3]))]
+    source.together = [checked_as_they_come(driver, made(driver).of([0, 3]))]
     driver.receive(source, driver.policy.on_factors)
     assert not driver.checks and driver.table.used[:4].tolist() == [1, 0, 0, 1]
     assert driver.bodies[0].job.matrix is None and any(memory is each for each in driver.snapshots.free[memory.shape])
@@ -209,7 +210,7 @@ def test_those_that_are_good_are_made_ready_where_they_are_checked_and_dropped_i
         driver.engine, "prepare_together", lambda bodies, own: prepared.extend(zip(bodies, own.steps, strict=True))
     )
     monkeypatch.setattr(driver.engine, "drop_factor", lambda body, factor: dropped.append((body, factor.step)))
-    source.together = [factors := checked_as_they_come(source, spoilt(made(driver), [2]))]
+    source.together = [factors := checked_as_they_come(driver, spoilt(made(driver), [2]))]
     own = list(enumerate(factors.steps))
     assert prepared == [each for each in own if each[0] != 2]
     source.over = {"bar5"}
@@ -222,7 +223,7 @@ def test_those_that_are_good_are_made_ready_where_they_are_checked_and_dropped_i
     dropped.clear()
     later = made(driver)
     monkeypatch.setattr(driver.table, "on_factors", lambda bodies, *_: [body != 7 for body in bodies.tolist()])
-    source.over, source.together = set(), [checked_as_they_come(source, later)]
+    source.over, source.together = set(), [checked_as_they_come(driver, later)]
     checked(driver)
     assert dropped == [(7, later.steps[7])]
 
@@ -230,8 +231,8 @@ def test_those_that_are_good_are_made_ready_where_they_are_checked_and_dropped_i
 def test_what_comes_while_others_are_adopted_is_adopted_later_as_it_came(monkeypatch):
     """It would be checked once more, one by one: `poll` returns factors of messages, too."""
     driver, source = start()
-    first = checked_as_they_come(source, made(driver).of(range(2)))
-    later = checked_as_they_come(source, made(driver).of(range(2, BODIES)))
+    first = checked_as_they_come(driver, made(driver).of(range(2)))
+    later = checked_as_they_come(driver, made(driver).of(range(2, BODIES)))
     adopt, alone = driver._many.adopt, []
 
     def slow(factors: FactorsTogether) -> None:
@@ -250,7 +251,7 @@ def test_what_comes_while_others_are_adopted_is_adopted_later_as_it_came(monkeyp
 def test_a_verdict_on_a_matrix_that_is_not_there_any_more_counts_for_nothing(monkeypatch):
     """Its memory may have been written to while it was checked: each of them is checked again, without it."""
     driver, source = start()
-    factors = checked_as_they_come(source, made(driver))
+    factors = checked_as_they_come(driver, made(driver))
     factors.reasons[4] = "spoilt meanwhile"
     driver.snapshots.release(driver.bodies[4])
     seen, check = [], driver.check.reject_reasons
@@ -261,24 +262,14 @@ def test_a_verdict_on_a_matrix_that_is_not_there_any_more_counts_for_nothing(mon
     assert [(factor.object, matrix) for given in seen for factor, matrix in given] == [("bar4", None)]
 
 
-@pytest.mark.parametrize("sent", [None, "another step", "positions"])
-def test_without_the_matrix_of_each_they_are_checked_later(sent):
-    driver, source = start()
-    factors, (step, values) = made(driver), driver.bodies[2].job.matrix
-    wrong = {None: None, "another step": (step + 1, values), "positions": (step, np.zeros((4, 3)))}
-    driver.bodies[2].job.matrix = wrong[sent]
-    assert begun(source, factors) is None and begun(source, factors.of([0, 1])) is not None
-    assert begun(source, replace(factors.of([0]), objects=["nobody"])) is None
-
-
 def test_those_that_are_not_of_the_size_of_their_object_are_checked_later():
-    driver, source = start()
+    driver, _ = start()
     factors, sim = made(driver), driver.simulation
     driver.check = FactorCheck(
         {b.name: sim.system.body_pattern(b.first, b.last) for b in sim.world.bodies[1:]}
         | {"bar0": sim.system.body_pattern(0, sim.world.bodies[1].last)}
     )
-    assert begun(source, factors) is None and begun(source, factors.of([1, 2])) is not None
+    assert begun(driver, factors) is None and begun(driver, factors.of([1, 2])) is not None
 
 
 def test_few_are_taken_one_by_one():

@@ -124,8 +124,8 @@ def test_many_factors_say_what_each_says():
                         on_checks(driver.table, [state.body.index], [factor.step])
                         state.job.in_flight, state.job.sent = bool(newer[k]), factor.step + int(newer[k])
         expected = [one.bodies[k].on_factor(factor, step) for k, factor in factors.items()]
-        states = [many.bodies[k] for k in factors]
-        assert on_factors(states, many.table, MadeFactors.of(list(factors.values())), step) == expected
+        bodies = np.array(list(factors))
+        assert on_factors(many.bodies, bodies, MadeFactors.of(list(factors.values())), step) == expected
         assert noted(one) == noted(many)
     assert min(t.factors.used for t in one.bodies) > 5
     assert one.bodies[0].factors.cost_by_method and one.bodies[0].factors.regularized

@@ -1,0 +1,224 @@
+# SPDX-License-Identifier: MIT
+"""Messages of factors are taken in by a thread, and count by what is known of their jobs at the end."""
+
+import logging
+import queue
+import time
+from collections.abc import Iterator
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import zenoh
+
+from protocol.channels import key
+from protocol.counters import Counters
+from protocol.messages_pb2 import FactorBatch
+from sim_server.network import batch_intake
+from sim_server.network.answers import Answers
+from sim_server.network.batch_intake import BatchIntake
+from sim_server.network.bookkeeping import Bookkeeping
+from sim_server.network.leases import Leases
+from sim_server.network.worker_registry import WorkerRegistry
+from sim_server.network.worker_reliability import WorkerReliability
+from sim_server.network.worker_timing import WorkerTiming
+from tests.support.answered_batch import GRAPHS, KINDS, MADE, answered
+from tests.support.in_flight import batch_in_flight
+
+CLOSED = object()
+NAMES = list(KINDS)
+
+
+class Ring:
+    """A subscriber, whose messages reach the thread unless it is held."""
+
+    def __init__(self) -> None:
+        self.waiting: queue.SimpleQueue[Any] = queue.SimpleQueue()
+        self.held: queue.SimpleQueue[Any] | None = None
+
+    def put(self, message: FactorBatch) -> None:
+        sample = SimpleNamespace(key_expr=key("factors", worker="w"), attachment=message.SerializeToString())
+        (self.waiting if self.held is None else self.held).put(sample)
+
+    def recv(self) -> Any:
+        if (sample := self.waiting.get()) is CLOSED:
+            raise zenoh.ZError("closed")
+        return sample
+
+    def try_recv(self) -> Any:
+        try:
+            return None if self.held is None else self.held.get_nowait()
+        except queue.Empty:
+            return None
+
+
+class Stage:
+    """An intake, the message that answers all jobs of one batch, and what becomes of it."""
+
+    def __init__(self) -> None:
+        made, self.ring = answered(), Ring()
+        self.message, self.batch, self.decoder, self.values = made.message, made.batch, made.decoder, made.values
+        self.counters, self.leases = Counters(logging.getLogger("test")), Leases(None)
+        registry, reliability = WorkerRegistry(7, 9.0), WorkerReliability()
+        self.book = Bookkeeping(registry, self.leases, WorkerTiming(), reliability, self.decoder, time.monotonic)
+        session: Any = SimpleNamespace(declare_subscriber=lambda *_: self.ring)
+        self.intake = BatchIntake(session, "s", self.counters, self.book, Answers(self.counters, self.book))
+        self.leases.next_numbers(len(NAMES))
+        self.leases.start(self.batch)
+
+    def send(self, message: FactorBatch | None = None) -> None:
+        """Sends a message, and waits until the thread has done with it."""
+        done = self.intake.done
+        self.ring.put(self.message if message is None else message)
+        end = time.monotonic() + 60
+        while self.intake.done == done:
+            assert time.monotonic() < end
+            time.sleep(1e-3)
+
+    def take(self) -> set[str]:
+        """Takes what the thread has done; returns the objects that have a factor now, which must be theirs."""
+        self.intake.take(self.intake.done)
+        found = {name for each in self.intake.together for name in each.objects}
+        for factors in self.intake.together:
+            for factor in factors:
+                np.testing.assert_array_equal(factor.values, self.values[factor.object])
+        self.intake.together = []
+        return found
+
+    def failed(self) -> set[str]:
+        return {name for name, _ in self.book.failures}
+
+
+@pytest.fixture
+def stage() -> Iterator[Stage]:
+    made = Stage()
+    yield made
+    made.ring.waiting.put(CLOSED)
+
+
+def test_factors_are_told_once_they_are_taken_and_their_jobs_are_over_then(stage):
+    stage.send()
+    assert len(stage.intake) == len(NAMES) and all(number in stage.intake for number in stage.batch.numbers)
+    assert stage.intake.together == [] and stage.leases.count("w") == len(NAMES)
+    assert stage.take() == set(NAMES)
+    assert len(stage.intake) == 0 and stage.leases.count("w") == 0 and stage.failed() == set()
+
+
+def test_of_a_job_that_is_over_meanwhile_nothing_is_told(stage):
+    stage.send()
+    stage.leases.forget_object("b")  # it has a new epoch
+    stage.leases.by_object["d"] = batch_in_flight(range(99, 100), ["d"], 1, 7, "float32", "v", 9.0).jobs[0]
+    stage.leases._reassigned.add(stage.batch.numbers[3])  # another worker has it now
+    assert stage.take() == {"a", "c", "e"} and stage.counters.refusals == {"epoch": 1}
+    assert stage.leases.count("w") == 0 and stage.failed() == set()
+
+
+def test_a_pattern_that_is_read_after_its_factors_came_is_in_time(stage):
+    """The thread may be at a message before the patterns are read that were sent ahead of it."""
+    known = stage.decoder.objects["c"]
+    held, known.patterns = known.patterns, {}
+    stage.send()
+    known.patterns = held
+    assert stage.take() == set(NAMES) and stage.counters.refusals == {} and stage.leases.count("w") == 0
+
+
+def test_a_pattern_that_was_never_sent_is_refused(stage):
+    stage.decoder.objects["c"].patterns = {}
+    stage.send()
+    assert stage.take() == set(NAMES) - {"c"} and stage.failed() == {"c"} and stage.counters.refusals == {"pattern": 1}
+    assert stage.leases.count("w") == 0
+
+
+def test_each_answer_counts_once(stage):
+    stage.message.jobs.append(stage.message.jobs[1])
+    for column in ("patterns", "nonzeros", "checksums", "seconds"):
+        getattr(stage.message, column).append(getattr(stage.message, column)[1])
+    stage.send()
+    stage.send()
+    assert stage.take() == set(NAMES) and stage.counters.refusals == {"duplicate": 2 + len(NAMES)}
+    assert stage.failed() == set()
+
+
+def test_what_is_no_answer_to_this_batch_costs_the_others_nothing(stage):
+    """A failure, a job that does not exist, and one of another batch, which is in another slot."""
+    other = batch_in_flight(range(50, 51), ["b"], 1, 5, "float32", "w", 9.0)
+    stage.leases.finish(stage.batch.jobs[1])
+    stage.leases.start(other)
+    stage.message.jobs[1], stage.message.jobs[4] = 50, 1 << 40
+    stage.message.failures.extend(["", "", "not positive definite", "", ""])
+    stage.send()
+    assert stage.take() == {"a", "d"}
+    assert stage.failed() == {"b", "c"} and stage.counters.refusals == {"slot": 1, "sequence": 1}
+    assert [job.object for job in stage.leases.jobs] == ["e"]
+
+
+def test_a_message_that_cannot_be_read_is_refused_and_the_next_is_taken(stage):
+    bad = FactorBatch()
+    bad.CopyFrom(stage.message)
+    bad.header.incarnation = 8
+    stage.send(bad)
+    stage.send()
+    assert stage.take() == set(NAMES) and stage.counters.refusals == {"incarnation": 1}
+
+
+def test_an_error_that_no_check_foresees_costs_its_message_alone(stage, monkeypatch):
+    with monkeypatch.context() as broken:
+        broken.setattr(batch_intake, "decode_several", lambda *_: {}["nose"])
+        stage.send()
+    assert stage.take() == set() and stage.failed() == set(NAMES) and stage.leases.count("w") == 0
+    assert stage.counters.refusals == {"unexpected": len(NAMES)} and len(stage.intake) == 0
+    stage.leases.start(stage.batch)
+    stage.send()
+    assert stage.take() == set(NAMES)
+
+
+def test_an_error_while_a_message_is_taken_ends_its_jobs(stage, monkeypatch):
+    monkeypatch.setattr(Answers, "duration", lambda *_: {}["nose"])
+    stage.send()
+    assert stage.take() == set() and stage.failed() == set(NAMES) and stage.leases.count("w") == 0
+    assert stage.counters.refusals == {"unexpected": 1} and len(stage.intake) == 0
+
+
+def test_what_waits_for_the_thread_is_taken_before_a_worker_is_forgotten(stage):
+    stage.ring.held = queue.SimpleQueue()
+    stage.ring.put(stage.message)
+    stage.intake.finish()
+    assert stage.take() == set(NAMES) and stage.leases.count("w") == 0
+
+
+def test_while_a_message_is_taken_in_its_worker_has_done_its_jobs(stage, monkeypatch):
+    seen: list[int] = []
+    decode = batch_intake.decode_several
+
+    def watched(*arguments: Any) -> Any:
+        seen.extend([stage.intake.done_by("w"), stage.intake.done_by("v")])
+        return decode(*arguments)
+
+    monkeypatch.setattr(batch_intake, "decode_several", watched)
+    stage.send()
+    assert seen == [len(NAMES), 0] and stage.intake.done_by("w") == 0
+
+
+def test_jobs_of_which_the_matrices_are_known_are_checked(stage):
+    """With the matrix of each, whatever the order of the answers."""
+    matrices = [np.full((2, 3, 3), float(k)) for k in range(len(NAMES))]
+    stage.batch.matrices, stage.batch.bodies = matrices, 10 + np.arange(len(NAMES))
+    asked: list[Any] = []
+    stage.intake.begin_check = lambda *jobs: asked.append(jobs)
+    order = [3, 0, 4, 1, 2]
+    for column in ("jobs", "patterns", "nonzeros", "checksums", "seconds"):
+        values = list(getattr(stage.message, column))
+        del getattr(stage.message, column)[:]
+        getattr(stage.message, column).extend(values[k] for k in order)
+    stage.send()
+    ((objects, epochs, patterns, given),) = asked
+    assert objects == [NAMES[k] for k in order] and epochs == [1] * len(order)
+    assert [pattern.id for pattern in patterns] == [MADE[KINDS[name]].pattern.id for name in objects]
+    assert all(own is matrices[k] for own, k in zip(given, order, strict=True))
+    stage.intake.take(1)
+    bodies = {
+        name: int(body) for each in stage.intake.together for name, body in zip(each.objects, each.bodies, strict=True)
+    }
+    assert bodies == {name: 10 + k for k, name in enumerate(NAMES)}
+    assert len(GRAPHS) == 2 and stage.take() == set(NAMES)
