@@ -114,13 +114,11 @@ class Maker:
 
     def use(
         self, bodies: np.ndarray, planned: SimpleNamespace, storages: list[list[int]], planes: int, steps: list[int]
-    ) -> None:
+    ) -> np.ndarray:
         if self.unusable.intersection(bodies.tolist()):
             raise NoMemory("no vectors")
         self.bodies["factor"][bodies] = [storage[0] for storage in storages]
         self.planes_used.append(planes)
-
-    def factor_rows(self, bodies: np.ndarray) -> np.ndarray:
         return self.bodies["factor"][bodies].view(np.uint8).reshape(len(bodies), 8)
 
 
