@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from sim_server.arrays import Int32
 from sim_server.backends.cpu.structs import REACTION, RECORD
 from sim_server.backends.measured import Measured, first_of_bodies
+from sim_server.backends.reused_memory import ReusedMemory
 
 Reals = NDArray[np.float64]
 OTHERS = 1 << 15  # reactions on grabs and other bodies that may wait to be read
@@ -48,6 +49,7 @@ class Reports:
         loop.others, loop.other_capacity = self._others.ctypes.data, OTHERS
         self._frame_poses = np.zeros((len(frames), 0, 7))
         self.frame_poses: dict[int, Reals] = {}
+        self._memory = ReusedMemory()  # of records that were read
         self._reported = 0  # step of the newest record that was read
 
     @property
@@ -81,19 +83,20 @@ class Reports:
         """New records since the last call, and what each body exerted on each obstacle (with contact) and then each
         holder, (k, count, 6): force [N], then torque about its position at the end of the step [N m]."""
         head, tail = int(self.loop.record_head), int(self.loop.record_tail)
-        out = part_of_ring(self._records, tail, head), part_of_ring(self._reactions, tail, head)
-        self.readings = part_of_ring(self._readings, tail, head)
+        rings = self._records, self._reactions, self._readings
+        *out, self.readings = (part_of_ring(ring, tail, head, self._memory) for ring in rings)
         self.loop.record_tail = head
         if head > tail:
             self._reported = int(out[0]["step"][-1])
-        return out
+        records, reactions = out
+        return records, reactions
 
     def other_reactions(self) -> NDArray[Any]:
         """What bodies exerted on grabs and on each other, (k,) of REACTION, up to the newest record that was read."""
         head, tail = int(self.loop.other_head), int(self.loop.other_tail)
         if head == tail:
             return np.zeros(0, REACTION)
-        out = part_of_ring(self._others, tail, head)
+        out = part_of_ring(self._others, tail, head, self._memory)
         out = out[: np.searchsorted(out["step"], self._reported, "right")]
         self.loop.other_tail = tail + len(out)
         return out
@@ -112,10 +115,10 @@ class Reports:
         return out
 
 
-def part_of_ring(ring: NDArray[Any], tail: int, head: int) -> NDArray[Any]:
-    """Copies the entries from number `tail` up to `head`, not included, of a ring."""
+def part_of_ring(ring: NDArray[Any], tail: int, head: int, memory: ReusedMemory) -> NDArray[Any]:
+    """Copies the entries from number `tail` up to `head`, not included, of a ring. memory: for the copy"""
     first, count = tail % len(ring), head - tail
-    out = np.empty((count, *ring.shape[1:]), ring.dtype)
+    out = memory.empty((count, *ring.shape[1:]), ring.dtype)
     if not out.size:
         return out
     source, target, size = _bytes_of(ring), _bytes_of(out), out.nbytes // count

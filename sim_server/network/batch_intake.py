@@ -74,9 +74,10 @@ class BatchIntake:
         return len(self._beside)
 
     def done_by(self, worker: str) -> int:
-        """Number of jobs that a worker has done, whose factors are copied and checked now."""
-        message = self._under_way
-        return len(message.jobs) if message is not None and message.message.worker == worker else 0
+        """Number of jobs that a worker has done, whose factors are copied and checked now, or were and are to be taken.
+        Those of messages that wait for the thread are left out: no more are to wait for it."""
+        arrived = {id(each): each for each in (self._under_way, *self._done) if isinstance(each, Arrived)}
+        return sum(len(each.jobs) for each in arrived.values() if each.message.worker == worker)
 
     # ---- in the thread of messages -------------------------------------------------------------------------
 

@@ -13,7 +13,7 @@ from protocol.messages_pb2 import Header, MatrixBatch
 from protocol.method import COMPLETE, Method
 from protocol.shared_memory.pool import Slot
 from sim_server.arrays import Float64, Int64
-from sim_server.network.factor_decoder import AnnouncedObject, CompleteFactors
+from sim_server.network.factor_decoder import AnnouncedObject
 from sim_server.network.jobs_in_flight import JobsInFlight
 from sim_server.network.native_copies import native_copies
 
@@ -34,11 +34,25 @@ class BatchLayout(NamedTuple):
 
     @classmethod
     def of(cls, known: Sequence[AnnouncedObject], method: str, dtype: str) -> "BatchLayout":
-        """Lays out the rooms of factors by a method, of a type."""
-        values, room = np.array(most_values(known, method), np.int64), np.dtype(dtype).itemsize
-        rooms = -(-values * room // ROOM_ALIGNMENT) * ROOM_ALIGNMENT
-        blocks, topologies = [each.blocks for each in known], [each.topology for each in known]
-        return cls(blocks, topologies, _known_patterns(known), rooms, np.cumsum(rooms) - rooms)
+        """Lays out the rooms of factors by a method, of a type. Those of jobs that must go alone have no bytes."""
+        rooms = _rooms([most_values(each, method) for each in known], dtype)
+        columns = zip(*((each.blocks, each.topology, each.known_patterns) for each in known), strict=True)
+        blocks, topologies, patterns = map(list, columns)
+        return cls(blocks, topologies, patterns, rooms, np.cumsum(rooms) - rooms)
+
+    @classmethod
+    def of_alike(cls, known: AnnouncedObject, count: int, dtype: str) -> "BatchLayout":
+        """Returns that of so many objects of one topology, of whose complete factors the size is known. known: one of
+        them. What patterns an object has alone is not told: its worker sends them again."""
+        rooms = _rooms([most_values(known, COMPLETE)], dtype)
+        blocks, topologies, patterns = [known.blocks] * count, [known.topology] * count, [[*known.complete.patterns]]
+        return cls(blocks, topologies, patterns * count, np.repeat(rooms, count), rooms * np.arange(count))
+
+    def part(self, some: slice) -> "BatchLayout":
+        """Returns that of a batch of some of the objects."""
+        rooms = self.rooms[some]
+        columns = self.blocks[some], self.topologies[some], self.known_patterns[some]
+        return BatchLayout(*columns, rooms, np.cumsum(rooms) - rooms)
 
     @property
     def bytes(self) -> int:
@@ -46,27 +60,16 @@ class BatchLayout(NamedTuple):
         return int(self.first[-1] + self.rooms[-1])
 
 
-def most_values(known: Sequence[AnnouncedObject], method: str) -> list[int]:
-    """Returns for how many values of a factor of each object there is room in a batch; 0 for a job that must go alone,
-    as the size of its factor is not known: that of an incomplete one may grow."""
-    if method == "incomplete_cholesky":
-        return [0] * len(known)
-    if method == COMPLETE and (shared := _shared(known)) is not None and shared.sizes:
-        return [max(shared.sizes.values())] * len(known)
-    return [each.most_values(method) for each in known]
+def most_values(known: AnnouncedObject, method: str) -> int:
+    """Returns for how many values of a factor of an object there is room in a batch; 0 for a job that must go alone, as
+    the size of its factor is not known: that of an incomplete one may grow."""
+    return 0 if method == "incomplete_cholesky" else known.most_values(method)
 
 
-def _known_patterns(known: Sequence[AnnouncedObject]) -> list[list[int]]:
-    shared = _shared(known)
-    if shared is None or any(each.patterns and not each.patterns.keys() <= shared.patterns.keys() for each in known):
-        return [each.known_patterns for each in known]
-    return [list(shared.patterns)] * len(known)
-
-
-def _shared(known: Sequence[AnnouncedObject]) -> CompleteFactors | None:
-    """What objects of one topology share; None: they are of several."""
-    first = known[0].complete
-    return first if all(each.complete is first for each in known) else None
+def _rooms(values: Sequence[int], dtype: str) -> Int64:
+    """Returns the bytes of rooms for so many values of a type."""
+    rooms: Int64 = -(-np.array(values, np.int64) * np.dtype(dtype).itemsize // ROOM_ALIGNMENT) * ROOM_ALIGNMENT
+    return rooms
 
 
 def batch_message(

@@ -84,6 +84,7 @@ class Dispatch(FactorSource):
         self._token_query_due = 0.0
         self._looked_at = -LOOK_PERIOD  # at which leases were looked through
         self._received = False  # within a round whose messages were taken in
+        self._known_rooms: dict[str, int] | None = None  # in such a round
         self._on_message: dict[str, Callable[[zenoh.Sample], None]] = {
             "worker": self._on_heartbeat,
             "pattern": self._on_pattern,
@@ -151,7 +152,7 @@ class Dispatch(FactorSource):
         """Takes in all messages that arrived at the begin of a round of calls, and no more within it."""
         with self._lock:
             self._receive()
-            self._received = True
+            self._received, self._known_rooms = True, None
         try:
             yield
         finally:
@@ -161,12 +162,19 @@ class Dispatch(FactorSource):
         """Number of jobs that workers can take now: one of each idle worker, more where all objects are small."""
         with self._lock:
             self._receive()
-            return sum(self._choice.rooms().values())
+            return sum(self._rooms().values())
+
+    def _rooms(self) -> dict[str, int]:
+        """Returns the rooms of workers; within a round they are those of the last call, if nothing was sent since."""
+        if self._known_rooms is None or not self._received:
+            self._known_rooms = self._choice.rooms()
+        return self._known_rooms
 
     def submit(self, job: Job) -> bool:
         """Sends a job to a worker with room; False if there is none or the object has a job in flight."""
         with self._lock:
             self._receive()
+            self._known_rooms = None
             return self._sender.submit(job)
 
     def submit_many(self, jobs: Sequence[Job]) -> list[bool]:
@@ -177,7 +185,8 @@ class Dispatch(FactorSource):
         """
         with self._lock:
             self._receive()
-            return self._sender.submit_many(jobs)
+            rooms, self._known_rooms = self._rooms(), None
+            return self._sender.submit_many(jobs, rooms)
 
     def poll(self) -> list[Factor]:
         """Returns the factors that arrived and passed all checks since the last call."""

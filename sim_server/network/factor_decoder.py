@@ -50,12 +50,12 @@ class CompleteFactors:
 
     patterns: of their complete factors, by id
     sizes: values of these factors, by id, without those of which the last one was rejected
-    objects: their names
+    epochs: present ones of these objects, by name
     """
 
     patterns: dict[int, FactorPattern] = field(default_factory=dict)
     sizes: dict[int, int] = field(default_factory=dict)
-    objects: set[str] = field(default_factory=set)
+    epochs: dict[str, int] = field(default_factory=dict)
 
 
 @dataclass
@@ -134,10 +134,10 @@ class FactorDecoder:
         """Begins a new epoch of an object; patterns of the last one are dropped."""
         header = topology.header
         if (last := self.objects.get(header.object)) is not None:
-            last.complete.objects.discard(header.object)
+            last.complete.epochs.pop(header.object, None)
         shape = topology_checksum(topology)
         complete = self._complete.setdefault(shape, CompleteFactors())
-        complete.objects.add(header.object)
+        complete.epochs[header.object] = header.epoch
         self.objects[header.object] = AnnouncedObject(
             header.epoch, 3 * topology.nodes, len(topology.columns) // 4, shape, complete
         )
@@ -276,7 +276,7 @@ class FactorDecoder:
         complete.patterns = _with_last(complete.patterns, pattern.id, pattern)
         sizes = {**complete.sizes, pattern.id: pattern.nonzeros}
         complete.sizes = {id: size for id, size in sizes.items() if id in complete.patterns}
-        self._unsized = self._unsized - complete.objects
+        self._unsized = self._unsized - complete.epochs.keys()
 
     def _from_slot(
         self, told: SlotMessage, nonzeros: int, job: InFlightJob

@@ -80,7 +80,8 @@ class FactorIntake:
 
     def fetched_from(self, worker: str) -> int:
         """Number of jobs that a worker has done, and whose factors are fetched from it part by part, or copied and
-        checked beside the caller: those of one message at most, as no more are to wait for that."""
+        checked beside the caller, or were: those of one message at most are under way, as no more are to wait for that.
+        """
         return self.batches.done_by(worker) + sum(
             self._decoding[number].job.worker == worker for number in self._fetches
         )

@@ -89,18 +89,19 @@ class JobSender:
             return False
         return self._send_alone(self._choice.choose(idle, job.object), job)
 
-    def submit_many(self, jobs: Sequence[Job]) -> list[bool]:
+    def submit_many(self, jobs: Sequence[Job], rooms: dict[str, int]) -> list[bool]:
         """Sends jobs of different objects, the most urgent first, those of small objects to one worker in one message.
+        rooms: as of WorkerChoice
 
         False as of `submit`.
         """
-        rooms = self._choice.rooms() if len(jobs) > 1 else {}
-        able = {name for name in rooms if self._choice.takes_batches(name)}
+        rooms = dict(rooms) if len(jobs) > 1 else {}
+        able = {name for name, room in rooms.items() if room > 1 and self._choice.takes_batches(name)}
         failing = bool(self._book.reliability.failing_objects)
         if isinstance(jobs, JobsTogether) and len(rooms) == len(able) == 1 and not failing:
             (worker,) = able
-            if (known := self._known_of(fitting := jobs[: rooms[worker]])) is not None:
-                return self._send_batches(worker, fitting, known) + [False] * (len(jobs) - len(fitting))
+            if (told := self._layout_of(fitting := jobs[: rooms[worker]])) is not None:
+                return self._send_batches(worker, fitting, told) + [False] * (len(jobs) - len(fitting))
         return self.submit_sorted(jobs, rooms, able, failing)
 
     def submit_sorted(
@@ -112,8 +113,8 @@ class JobSender:
         idle, known = [name for name, room in rooms.items() if room > 0], [self._check(job) for job in jobs]
         for place, job in enumerate(jobs):
             worker = self._worker_for(job, idle, rooms, failing) if idle else None
-            together = worker in able and not job.positions and most_values([known[place]], job.method.name)[0] > 0
-            if worker is None or not together:
+            alone = worker not in able or job.positions or not most_values(known[place], job.method.name)
+            if worker is None or alone:
                 taken[place] = self.submit(job)
                 rooms = self._choice.rooms()
                 for (name, _), places in batches.items():
@@ -125,29 +126,39 @@ class JobSender:
                 idle.remove(worker)
             batches.setdefault((worker, (job.dtype, job.method)), []).append(place)
         for (worker, _), places in batches.items():
-            sent = self._send_batches(worker, JobsTogether.of([jobs[k] for k in places]), [known[k] for k in places])
+            together = JobsTogether.of([jobs[k] for k in places])
+            told = BatchLayout.of([known[k] for k in places], together.method.name, together.dtype)
+            sent = self._send_batches(worker, together, told)
             for place, well in zip(places, sent, strict=True):
                 taken[place] = well
         return taken
 
-    def _known_of(self, jobs: JobsTogether) -> list[AnnouncedObject] | None:
-        """Returns what is known of the objects of jobs if all of them may share batches, as those of many small bodies
-        do; None: they may not."""
+    def _layout_of(self, jobs: JobsTogether) -> BatchLayout | None:
+        """Returns the layout of jobs if all of them may share batches, as those of many small bodies do; None: they may
+        not."""
         objects, flying = self._book.decoder.objects, self._book.leases.by_object
-        known = [each for each in map(objects.get, jobs.objects) if each is not None]
-        if [each.epoch for each in known] != jobs.epochs or len(set(jobs.objects)) < len(jobs):
+        if not flying.keys().isdisjoint(jobs.objects) or len(set(jobs.objects)) < len(jobs):
             return None
-        if not flying.keys().isdisjoint(jobs.objects) or 0 in most_values(known, jobs.method.name):
-            return None
-        if [(each.blocks, 3, 3) for each in known] != list(map(SHAPE, jobs.values)):
-            return None
-        return known if set(map(DTYPE, jobs.values)) == {FLOAT64} else None
+        first, method = objects.get(jobs.objects[0]), jobs.method.name
+        if (
+            first is not None
+            and list(map(first.complete.epochs.get, jobs.objects)) == jobs.epochs
+            and method == COMPLETE
+        ):
+            told = BatchLayout.of_alike(first, len(jobs), jobs.dtype)
+        else:
+            known = [each for each in map(objects.get, jobs.objects) if each is not None]
+            if [each.epoch for each in known] != jobs.epochs:
+                return None
+            told = BatchLayout.of(known, method, jobs.dtype)
+        shapes = [(blocks, 3, 3) for blocks in told.blocks]
+        fit = shapes == list(map(SHAPE, jobs.values)) and set(map(DTYPE, jobs.values)) == {FLOAT64}
+        return told if fit and told.rooms.all() else None
 
-    def _send_batches(self, worker: str, jobs: JobsTogether, known: Sequence[AnnouncedObject]) -> list[bool]:
-        sent: list[bool] = []
-        for k in range(0, len(jobs), MOST_TOGETHER):
-            sent += self._send_batch(worker, jobs[k : k + MOST_TOGETHER], known[k : k + MOST_TOGETHER])
-        return sent
+    def _send_batches(self, worker: str, jobs: JobsTogether, told: BatchLayout) -> list[bool]:
+        """Sends jobs to a worker in as few messages as they fit into."""
+        parts = [slice(k, k + MOST_TOGETHER) for k in range(0, len(jobs), MOST_TOGETHER)]
+        return [sent for part in parts for sent in self._send_batch(worker, jobs[part], told.part(part))]
 
     def _check(self, job: Job) -> AnnouncedObject:
         """Returns what is known of the object of a job. Raises ValueError for one that is not of its epoch or shape."""
@@ -171,12 +182,9 @@ class JobSender:
 
     # ---- a batch ---------------------------------------------------------------------------------------------
 
-    def _send_batch(self, worker: str, jobs: JobsTogether, known: Sequence[AnnouncedObject]) -> list[bool]:
+    def _send_batch(self, worker: str, jobs: JobsTogether, told: BatchLayout) -> list[bool]:
         """Sends jobs to a worker in one message, or one by one if there are no slots for them together."""
-        slots, leases = None, self._book.leases
-        if len(jobs) > 1:
-            told = BatchLayout.of(known, jobs.method.name, jobs.dtype)
-            slots = self._allocate_batch(jobs, told)
+        leases, slots = self._book.leases, self._allocate_batch(told) if len(jobs) > 1 else None
         if slots is None:
             return [self._send_alone(worker, job) for job in jobs]
         seconds, periods = leases.terms.of_all(jobs.objects, told.blocks, worker, jobs.method.name)
@@ -203,10 +211,10 @@ class JobSender:
         finally:
             filling.over = True
 
-    def _allocate_batch(self, jobs: JobsTogether, told: BatchLayout) -> tuple[Slot, Slot] | None:
+    def _allocate_batch(self, told: BatchLayout) -> tuple[Slot, Slot] | None:
         """Allocates a slot for matrices and one for factors; None if there is not enough shared memory."""
         assert self._pool is not None
-        users = len(jobs) + 1  # and the thread that sends them
+        users = len(told.blocks) + 1  # and the thread that sends them
         matrices = self._pool.lend(72 * sum(told.blocks), users)
         factors = self._pool.lend(told.bytes, users)
         if matrices is not None and factors is not None:

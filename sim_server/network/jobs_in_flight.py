@@ -3,6 +3,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from itertools import repeat
 
 import numpy as np
 
@@ -60,8 +61,7 @@ class JobsInFlight:
     jobs: "list[InFlightJob]" = field(init=False)
 
     def __post_init__(self) -> None:
-        rows = zip(self.numbers, self.objects, range(len(self.objects)), strict=True)
-        self.jobs = [InFlightJob(number, name, self, place) for number, name, place in rows]
+        self.jobs = list(map(InFlightJob, self.numbers, self.objects, repeat(self), range(len(self.objects))))
 
     def __len__(self) -> int:
         return len(self.objects)

@@ -59,7 +59,7 @@ class LeaseTerms:
         answered = self._answered.get(worker, {}).get((method, False), set())
         if len(self._seconds) == 1 and not self._doublings and answered.issuperset(objects):  # as nearly always
             usual = LEASE_FACTOR * np.array(list(map(self._seconds[worker].__getitem__, objects)))
-            return np.clip(usual, MIN_LEASE, MAX_LEASE), np.maximum(usual, MIN_EXCLUSIVE)
+            return np.minimum(np.maximum(usual, MIN_LEASE), MAX_LEASE), np.maximum(usual, MIN_EXCLUSIVE)
         leases = [self.lease(object, worker, method) for object in objects]
         periods = [self.exclusive_period(*each) for each in zip(objects, blocks, strict=True)]
         return np.array(leases), np.array(periods)

@@ -16,7 +16,7 @@ from sim_server.network.jobs_in_flight import InFlightJob, JobsInFlight
 from sim_server.network.lease_terms import DELIVERY, LeaseTerms
 
 MAX_EXPIRED = 2  # expired jobs with which a worker still gets slots of shared memory
-BATCH, DEADLINE, NUMBER = attrgetter("batch"), attrgetter("deadline"), attrgetter("number")  # of jobs
+BATCH, NUMBER = attrgetter("batch"), attrgetter("number")  # of jobs
 
 
 class SlotAllocator(Protocol):
@@ -73,7 +73,7 @@ class Leases:
         jobs = self.by_worker.get(worker, {})
         for job in dropped:
             jobs.pop(job.number, None)
-        latest = max(map(DEADLINE, dropped))
+        latest = max(float(batch.deadlines.max()) for batch in set(map(BATCH, dropped)))
         if self._deadlines is not None and latest >= self._deadlines.get(worker, latest):
             self._deadlines = None  # the latest one may be another now
         if not jobs:

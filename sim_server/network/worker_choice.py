@@ -88,10 +88,10 @@ class WorkerChoice:
         return info is not None and info.device_memory and self.has_slots(worker)
 
     def takes_batches(self, worker: str) -> bool:
-        """True if several jobs of a worker may share a message. It has room for several only where all objects are
-        small."""
+        """True if several jobs of a worker that has room for them may share a message: it has only where all objects
+        are small."""
         info = self._book.registry.info(worker)
-        return info is not None and info.batches and self.room(worker) > 1 and self.has_slots(worker)
+        return info is not None and info.batches and self.has_slots(worker)
 
     def choose(self, idle: list[str], object: str, rooms: Mapping[str, int] | None = None) -> str:
         """Chooses the worker with the fewest expired jobs; then the one that would be done first, the one with the

@@ -319,13 +319,13 @@ def on_requests(table: UpdateTable, rows: Int64, copies: Sequence[Float64], firs
 
 def on_sent(table: UpdateTable, bodies: Sequence[int] | Int64, steps: Sequence[int] | Int64) -> None:
     """Takes note of copies that were sent, of some steps. They are kept until their factors came."""
-    rows, copies = np.asarray(bodies, np.int64), table.copies
-    sent = [copies[row] for row in rows.tolist()]
-    for row, copy in zip(rows.tolist(), sent, strict=True):
-        table.matrices[row], copies[row] = copy, None
-    table.positions[rows] = [copy is not None and copy.ndim == 2 for copy in sent]
+    rows, copies, matrices = np.asarray(bodies, np.int64), table.copies, table.matrices
+    for row in rows.tolist():
+        matrices[row], copies[row] = copies[row], None
+    sent = [matrices[row] for row in rows.tolist()]
+    table.positions[rows] = [matrix is not None and matrix.ndim == 2 for matrix in sent]
     table.sent[rows] = steps
-    table.matrix_steps[rows] = np.where([copy is None for copy in sent], NONE, table.sent[rows])
+    table.matrix_steps[rows] = np.where([matrix is None for matrix in sent], NONE, table.sent[rows])
     table.in_flight[rows], table.copying[rows] = True, False
     table.excess_sent[rows], table.excess[rows] = table.excess[rows], 0.0
 

@@ -202,10 +202,12 @@ class Driver:
                 self.make_job(self.bodies[k], step) for k, step in zip(bodies.tolist(), steps.tolist(), strict=True)
             ]
             return [job for job in made if job is not None]
-        rows, copies = bodies.tolist(), self.table.copies
+        rows = bodies.tolist()
+        names, warps, copies = (
+            [column[row] for row in rows] for column in (self._names, self._warped, self.table.copies)
+        )
         return JobsTogether(
-            bodies, [self._names[row] for row in rows], [1] * len(rows), steps.tolist(),
-            [self._warped[row] for row in rows], [cast(Float64, copies[row]) for row in rows], self._dtype,
+            bodies, names, [1] * len(rows), steps.tolist(), warps, cast(list[Float64], copies), self._dtype,
             self._method, self.engine.staged_matrices(bodies).tolist(),
         )  # fmt: skip
 

@@ -12,9 +12,9 @@ from sim_server.arrays import Float64
 from sim_server.updates.stats import RunningMean
 
 MAX_DEPTH = 256  # matrices held at once
+SHARE = 8  # of the bodies one in so many at most: more come sooner, and grow older on their way than that is worth
 MAX_WAIT = 2  # steps that a copied matrix may wait for a worker, and those that a copy takes beyond one
-WINDOW = 0.05  # s over which matrices that are sent are counted
-MORE = 1.5  # copies that are begun over those that are sent meanwhile
+MORE = 1.5  # copies that are begun over those that a worker could make meanwhile by what it reports
 TRANSFER = 1e-3  # s of a job beside the factorization, about
 
 
@@ -23,14 +23,13 @@ class PrefetchDepth:
     where a factorization takes longer than that.
 
     patience: steps that a copy may wait for a worker
+    queued: several jobs wait at each worker
     """
 
     def __init__(self) -> None:
-        self.depth, self.patience = 0, MAX_WAIT
+        self.depth, self.patience, self.queued = 0, MAX_WAIT, False
         self._period = RunningMean()  # s from step to step
-        self._copy = RunningMean()  # s from the request of a copy until it is there
-        self._rate = RunningMean()  # matrices that were sent in a second
-        self._sent, self._since = 0, 0.0
+        self._copy = RunningMean()  # s from the request of a copy until it can be sent
         self._last: tuple[int, float] | None = None
 
     def on_step(self, step: int, now: float) -> bool:
@@ -43,29 +42,22 @@ class PrefetchDepth:
         return True
 
     def on_copy(self, seconds: float) -> None:
-        """Takes note of copies that are there so many seconds after their requests, in the mean."""
+        """Takes note of copies that could be sent so many seconds after their requests, in the mean."""
         self._copy.add(seconds)
-
-    def on_sent(self, count: int, now: float) -> None:
-        """Takes note of matrices that were sent at the time `now` [s], or of none."""
-        self._sent += count
-        if (lasted := now - self._since) > WINDOW:
-            self._rate.add(self._sent / lasted)
-            self._sent, self._since = 0, now
 
     def update(self, seconds: Float64, workers: int, queued: bool = False) -> None:
         """Computes the depth.
 
         seconds: of a factorization of each body, NaN: not known yet
-        queued: several jobs wait at each worker, for which their transfer then takes no time. A few more copies are
-            begun then than are sent in the time that they take
+        queued: several jobs wait at each worker, for which their transfer then takes no time
         """
-        self.depth, period, mean = 0, self._period.value, _mean(seconds)
+        self.depth, self.queued = 0, queued
+        period, mean = self._period.value, _mean(seconds)
         if mean is not None and period is not None:
             ahead = max(period, self._copy.value or 0.0)
             depth = workers * period / (mean + TRANSFER)
-            if queued and self._rate.value is not None:
-                depth = max(depth, min(workers * ahead / mean, MORE * self._rate.value * ahead))
+            if queued:
+                depth = max(depth, min(MORE * workers * ahead / mean, len(seconds) / SHARE))
             self.depth = min(int(depth), MAX_DEPTH)
             self.patience = MAX_WAIT + int(ahead / period) - 1 if period > 0 else MAX_WAIT
 

@@ -54,7 +54,7 @@ class SnapshotPool:
             engine.request_matrix(body.index, copy)
         job.set_copy(copy)
 
-    def request_all(self, bodies: Sequence[int], states: Sequence[BodyUpdateState]) -> None:
+    def request_all(self, bodies: Sequence[int] | Int64, states: Sequence[BodyUpdateState]) -> None:
         """Does `request` for some bodies, at once where the loop has memory for their matrices. states: of all"""
         engine, rows = self._simulation.engine, np.asarray(bodies, np.int64)
         whole = self._solver.build != "worker" and self._simulation.splits is None
@@ -73,11 +73,10 @@ class SnapshotPool:
 
     def completed(self) -> tuple[Int64, Int64]:
         """Returns the bodies whose copy is there, in the order of the requests, and the steps of these copies."""
-        waiting = np.flatnonzero(self._table.copying)
+        waiting = self._table.in_order_of_requests()
         steps = self._simulation.engine.matrix_steps(waiting)
-        there = np.flatnonzero(steps >= 0)
-        ordered = there[np.argsort(self._table.request[waiting[there]])]
-        return waiting[ordered], steps[ordered]
+        there = steps >= 0
+        return waiting[there], steps[there]
 
     def suffices(self, state: BodyUpdateState, step: int) -> bool:
         """True if the copy of a step is all that a worker needs. Positions do not tell of the springs of a grab, nor of

@@ -28,6 +28,7 @@ constexpr int NO_STEP = -1;
 struct Table {
     double *excess, *latest, *lost, *iteration_cost, *cost, *first_excess, *latency;
     const double* error_bound;
+    const int64_t* request;
     int64_t *factor_step, *max_factor_age, *refused, *newest, *sent, *checked, *failures, *used;
     bool* in_flight;
     const bool *dropped, *copying, *frozen;
@@ -157,6 +158,15 @@ void wf_count(const Table* t, int64_t* counts) {
         failing += t->failures[b] > 0;
     }
     counts[0] = copying, counts[1] = flying, counts[2] = failing;
+}
+
+// Writes the bodies whose copy is requested or waits to be sent, in the order of the requests; returns how many.
+int64_t wf_copying(const Table* t, int64_t* body) {
+    int64_t n = 0;
+    for (int64_t b = 0; b < t->bodies; ++b)
+        if (t->copying[b]) body[n++] = b;
+    std::sort(body, body + n, [t](int64_t one, int64_t other) { return t->request[one] < t->request[other]; });
+    return n;
 }
 
 // Writes the requests of all bodies but frozen ones, or only of those whose matrix may go `ahead` of the check of their last factor

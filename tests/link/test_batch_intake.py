@@ -187,7 +187,7 @@ def test_what_waits_for_the_thread_is_taken_before_a_worker_is_forgotten(stage):
     assert stage.take() == set(NAMES) and stage.leases.count("w") == 0
 
 
-def test_while_a_message_is_taken_in_its_worker_has_done_its_jobs(stage, monkeypatch):
+def test_until_a_message_is_taken_its_worker_has_done_its_jobs(stage, monkeypatch):
     seen: list[int] = []
     decode = batch_intake.decode_several
 
@@ -197,7 +197,10 @@ def test_while_a_message_is_taken_in_its_worker_has_done_its_jobs(stage, monkeyp
 
     monkeypatch.setattr(batch_intake, "decode_several", watched)
     stage.send()
-    assert seen == [len(NAMES), 0] and stage.intake.done_by("w") == 0
+    assert seen == [len(NAMES), 0]
+    assert [stage.intake.done_by(name) for name in "wv"] == seen, "who sends jobs has not taken it yet"
+    stage.intake.take(1)
+    assert stage.intake.done_by("w") == 0
 
 
 def test_jobs_of_which_the_matrices_are_known_are_checked(stage):

@@ -10,6 +10,7 @@ from google.protobuf.descriptor import FieldDescriptor
 from protocol import messages_pb2 as pb
 from sim_server.backends.cpu.structs import RECORD
 from sim_server.backends.kinds import Kind
+from sim_server.backends.reused_memory import ReusedMemory
 from sim_server.backends.ring_buffers import part_of_ring
 from sim_server.recording import messages, wire
 from sim_server.recording.object_steps import COPIED, KNOWN, OPTIONAL, Additions, Reactions
@@ -119,14 +120,14 @@ def test_fields_that_are_told_are_those_of_the_message():
 
 @pytest.mark.parametrize("kind", [RECORD, np.dtype("f8")])
 def test_a_part_of_a_ring_is_what_an_index_array_gives(kind):
-    rng = np.random.default_rng(0)
+    rng, memory = np.random.default_rng(0), ReusedMemory()
     ring = rng.integers(0, 255, 7 * kind.itemsize, np.uint8).view(kind)
     for tail in range(20):
         for count in range(8):
-            found = part_of_ring(ring, tail, tail + count)
+            found = part_of_ring(ring, tail, tail + count, memory)
             assert (
                 found.tobytes() == ring[np.arange(tail, tail + count) % 7].tobytes()[: found.nbytes] or kind is RECORD
             )
             for name in kind.names or ():
                 np.testing.assert_array_equal(found[name], ring[name][np.arange(tail, tail + count) % 7])
-    assert part_of_ring(np.zeros((5, 0, 6)), 3, 8).shape == (5, 0, 6)
+    assert part_of_ring(np.zeros((5, 0, 6)), 3, 8, memory).shape == (5, 0, 6)

@@ -10,7 +10,7 @@ from protocol.factor import Factor
 from sim_server.updates.driver import Driver
 from sim_server.updates.factor_source import Inline, Job
 from sim_server.updates.policies.free_running import Async
-from sim_server.updates.prefetch import MAX_DEPTH, MAX_WAIT, MORE, TRANSFER, PrefetchDepth
+from sim_server.updates.prefetch import MAX_DEPTH, MAX_WAIT, MORE, SHARE, TRANSFER, PrefetchDepth
 from tests.scenes import bar
 from tests.updates.test_policies import falling, patterns_of
 
@@ -43,20 +43,15 @@ def test_as_many_as_workers_can_take_within_a_step(period, service, workers, dep
 
 def test_copies_that_take_several_steps_are_begun_ahead():
     """As on a GPU, whose steps go on while a matrix travels to the host."""
-    prefetch, seconds = paced(0.001), np.array([2e-4])
+    prefetch, seconds = paced(0.001), np.full(1000, 2e-4)
     prefetch.on_copy(0.01)
     prefetch.update(seconds, 1, queued=True)
-    assert prefetch.depth == 0, "nothing was sent yet"
-    for k in range(1, 100):
-        prefetch.on_sent(20, 0.02 * k)  # 1,000 a second: 10 while a copy travels, of 50 that the worker could make
-    prefetch.update(seconds, 1, queued=True)
-    assert prefetch.depth == pytest.approx(MORE * 10, rel=0.1) and prefetch.patience == pytest.approx(
-        MAX_WAIT + 9, abs=1
-    )
-    for k in range(100, 200):
-        prefetch.on_sent(200, 0.02 * k)
-    prefetch.update(seconds, 1, queued=True)
-    assert prefetch.depth == pytest.approx(50, abs=1), "as many as it can make"
+    assert prefetch.depth == pytest.approx(MORE * 50, abs=1), "a few more than it can make until they are there"
+    assert prefetch.patience == pytest.approx(MAX_WAIT + 9, abs=1)
+    prefetch.update(seconds, 3, queued=True)
+    assert prefetch.depth == 1000 // SHARE, "all of them would be on their way for long"
+    prefetch.update(np.full(8000, 2e-4), 99, queued=True)
+    assert prefetch.depth == MAX_DEPTH
     prefetch.update(seconds, 1)
     assert prefetch.depth == 0, "jobs that travel one by one keep a worker waiting"
 
@@ -188,6 +183,9 @@ def test_the_matrix_of_a_body_that_needs_no_factor_is_not_prefetched():
     assert set(sent) == {f"beam{k}" for k in range(6)}, "who had none got one, and then those idle workers are given"
     policy.exchange()
     assert sum(t.job.copy is not None for t in driver.bodies) <= 1
+    policy.prefetch.queued = True
+    policy.exchange()
+    assert sum(t.job.copy is not None for t in driver.bodies) > 1, "a worker takes many together"
 
 
 def test_each_copy_of_a_body_alone_is_timed():

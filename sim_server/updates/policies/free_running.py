@@ -102,11 +102,12 @@ class Async(UpdatePolicy):
                     requests = requests.of(self.wants(requests, step))
                 chosen += pick(requests, room, solver.update_floor_steps, solver.schedule, overdue)
         chosen = chosen[left:]
-        # Request their matrices; in advance only those of bodies that need a factor
-        table, rows = driver.table, np.array(chosen, np.int64)
-        needed = (table.sent[rows] == NONE) | (table.excess[rows] > 0)
-        needed[:idle] = True
-        wanted = rows[needed]
+        # Request their matrices; in advance only those of bodies that need a factor, unless workers have many at a time
+        table, wanted = driver.table, np.array(chosen, np.int64)
+        if not self.prefetch.queued:
+            needed = (table.sent[wanted] == NONE) | (table.excess[wanted] > 0)
+            needed[:idle] = True
+            wanted = wanted[needed]
         driver.snapshots.request_all(wanted, driver.bodies)
         if len(wanted) < places:
             self._exhausted = step
@@ -142,16 +143,22 @@ class Async(UpdatePolicy):
 
     def _send_copies(self) -> None:
         """Sends copies to idle workers in the order of the requests. With a prefetch depth others wait their turn."""
-        driver, now = self.driver, time.monotonic()
-        bodies, steps = driver.snapshots.completed()
-        self._note_copies(bodies, now)
+        driver = self.driver
+        there, steps = driver.snapshots.completed()
+        bodies = there
         if self.prefetch.depth and len(bodies):
             idle = driver.source.ready()
             late = driver.engine.step - steps[idle:] > self.prefetch.patience
             self._discard(bodies[idle:][late])
             bodies, steps = bodies[:idle], steps[:idle]
-        jobs = driver.make_jobs(bodies, steps) if len(bodies) else []
-        self.prefetch.on_sent(len(jobs), now)
+        if len(bodies):
+            self._send(bodies, steps)
+        self._note_copies(there, time.monotonic())
+
+    def _send(self, bodies: Int64, steps: Int64) -> None:
+        """Sends the copies of some bodies, which are there, of some steps."""
+        driver = self.driver
+        jobs = driver.make_jobs(bodies, steps)
         if not jobs:
             return
         if len(jobs) < len(bodies):  # others were discarded
@@ -162,7 +169,7 @@ class Async(UpdatePolicy):
         self._discard(bodies[~taken])
 
     def _note_copies(self, bodies: Int64, now: float) -> None:
-        """Takes note of how long copies took that are there, in the order of their requests."""
+        """Takes note of how long it took until copies could be sent that are there, in the order of their requests."""
         table = self.driver.table
         if len(new := bodies[table.request[bodies] > self._newest_copy]):
             self._newest_copy = int(table.request[new[-1]])
