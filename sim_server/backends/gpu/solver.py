@@ -51,6 +51,11 @@ PLAIN = SolverFeatures()
 PCG_ARGUMENTS, TRIAL_CLOCK = PCG.dtype("PcgArguments"), PCG.dtype("TrialClock")
 
 
+def _bytes_of(rows: NDArray[np.void]) -> NDArray[np.uint8]:
+    """Returns the bytes of some rows, (rows, bytes)."""
+    return rows.view(np.uint8).reshape(len(rows), rows.itemsize)
+
+
 class PlannedInverse(NamedTuple):
     """A plan of inverses on the device, and what builds them."""
 
@@ -96,8 +101,8 @@ class PcgSolver:
             features = replace(features, smoothing=None)  # smoothed.cu has no pool
         self.features = features
         self.bodies = np.zeros(len(ranges), PCG_BODY)
-        words = self.bodies.view(np.uint64).reshape(len(ranges), -1)  # which NumPy copies faster than fields
-        self._factor_part = words[:, SETTINGS_BYTES // words.itemsize :]
+        row, part = PCG_BODY.itemsize, np.dtype((np.void, FACTOR.itemsize))  # NumPy copies fields one by one
+        self._factor_part = np.ndarray(len(ranges), part, self.bodies.data, SETTINGS_BYTES, (row,))
         self.bodies["first"], self.bodies["nodes"] = layout.spans[:, 0], layout.nodes
         self.bodies["blocks"], self.bodies["first_range"] = layout.assigned.blocks, layout.partition.first
         self._work = self._memory(len(arrays["row_start"]) - 1)
@@ -370,7 +375,7 @@ class PcgSolver:
         for body in [body for body in bodies.tolist() if in_row.get(body) is not planned.plan]:
             self._use_plan(body, planned.plan, planes)
         rows = self._factor_part[bodies]
-        factors, targets = rows.view(FACTOR)[:, 0], np.array([storage.target for storage in storages], np.uint64)
+        factors, targets = rows.view(FACTOR), np.array([storage.target for storage in storages], np.uint64)
         factors["matrix"], factors["scale"] = targets[:, 0], targets[:, 1]
         factors["factor_step"], factors["helper"] = steps, 0
         self._factor_part[bodies] = rows
@@ -379,11 +384,11 @@ class PcgSolver:
                 if storage.far:
                     self._use_far(body, planned, storage.far)
             return self.factor_rows(bodies)
-        return rows.view(np.uint8)
+        return _bytes_of(rows)
 
     def factor_rows(self, bodies: Int64) -> NDArray[np.uint8]:
         """Returns what the host rows of bodies tell of their factors, (bodies, bytes)."""
-        return self._factor_part[bodies].view(np.uint8)
+        return _bytes_of(self._factor_part[bodies])
 
     def _use_plan(self, body: int, device_plan: DevicePlan, planes: int) -> None:
         """Has a body use factors of another plan."""
