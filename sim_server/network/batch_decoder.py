@@ -4,7 +4,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,8 +18,6 @@ from sim_server.backends.factors_together import FactorsTogether
 from sim_server.network.factor_decoder import LARGE, AnnouncedObject, FactorDecoder, check_slot
 from sim_server.network.jobs_in_flight import InFlightJob, JobsInFlight
 from sim_server.updates.take_in import BeginCheck, SentMatrices, TakenIn, take_in
-
-T = TypeVar("T")
 
 
 class DecodedFactors(NamedTuple):
@@ -65,9 +63,10 @@ class Expected(NamedTuple):
     known: list[AnnouncedObject]
     patterns: list[FactorPattern]
 
-    def of_batch(self, column: Sequence[T]) -> list[T]:
-        """Returns some of the entries of a column of the batch."""
-        return [column[place] for place in self.places]
+    @property
+    def whole(self) -> bool:
+        """True if they are all jobs of the batch, in its order."""
+        return len(self.places) == len(self.batch) and self.places == list(range(len(self.batch)))
 
     def of(self, rows: Sequence[int]) -> "Expected":
         """Returns some of them."""
@@ -81,8 +80,14 @@ class Expected(NamedTuple):
         batch = self.batch
         if not len(batch.matrices) or batch.positions:
             return None
-        objects, epochs = self.of_batch(batch.objects), self.of_batch(batch.epochs)
-        return begin_check(objects, epochs, self.patterns, self.of_batch(batch.matrices))
+        objects, epochs, matrices = self.of_batch(batch.objects, batch.epochs, batch.matrices)
+        return begin_check(objects, epochs, self.patterns, matrices)
+
+    def of_batch(self, *columns: Sequence[Any]) -> list[list[Any]]:
+        """Returns their entries of columns of the batch, which nobody changes."""
+        if self.whole:
+            return [column if isinstance(column, list) else list(column) for column in columns]
+        return [[column[place] for place in self.places] for column in columns]
 
     @property
     def bodies(self) -> Int64 | None:
@@ -115,8 +120,11 @@ def decode_several(
     for row, pattern in enumerate(found.patterns):
         if row not in wrong:
             rows.setdefault(pattern.id, []).append(row)
-            decoder.note_size(found.known[row], pattern, found.batch.objects[found.places[row]], method)
-    good = [_together(columns, found.of(own), taken.of(own), sent) for own in rows.values()]
+    good = []
+    for own in rows.values():
+        some = found.of(own)
+        good.append(_together(columns, some, taken.of(own), sent))
+        decoder.note_sizes(good[-1][1].objects, some.known, some.patterns[0], method)
     return DecodedFactors(good, [*refused, *((found.answers[row], why) for row, why in wrong.items())])
 
 
@@ -195,10 +203,10 @@ def _together(
 ) -> tuple[list[int], FactorsTogether]:  # fmt: skip
     """Returns factors of one pattern, and their places among the answers."""
     batch, told = found.batch, found.told
+    objects, epochs, steps, warps = found.of_batch(batch.objects, batch.epochs, batch.steps, batch.warps)
     factors = FactorsTogether(
-        found.patterns[0], batch.worker, batch.method, found.of_batch(batch.objects), found.of_batch(batch.epochs),
-        found.of_batch(batch.steps), found.of_batch(batch.warps), taken.values, [columns.seconds[k] for k in told],
-        [columns.remedies[k][:200] for k in told], bodies=found.bodies,
+        found.patterns[0], batch.worker, batch.method, objects, epochs, steps, warps, taken.values,
+        [columns.seconds[k] for k in told], [columns.remedies[k][:200] for k in told], bodies=found.bodies,
     )  # fmt: skip
     if sent is not None:
         sent.end(factors, taken)

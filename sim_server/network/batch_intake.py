@@ -25,7 +25,7 @@ from sim_server.network.bookkeeping import Bookkeeping
 from sim_server.network.jobs_in_flight import InFlightJob
 from sim_server.updates.take_in import BeginCheck
 
-WAITING = 64  # messages that may wait; beyond that the oldest is lost
+WAITING = 64  # messages that may wait to be taken in, beyond which the oldest is lost, and as many to be taken
 
 
 @dataclass(eq=False)
@@ -63,8 +63,8 @@ class BatchIntake:
         self._under_way: Arrived | None = None  # in the thread
         self._done: deque[Arrived | Refused] = deque()  # oldest first
         self._working = threading.Lock()  # held while a message is taken in
+        self._room = threading.Semaphore(WAITING)  # for messages that are done
         self._ring = session.declare_subscriber(key("factors", server), RingChannel(WAITING))
-        threading.Thread(target=self._serve, name="factors of messages", daemon=True).start()
 
     def __contains__(self, number: int) -> bool:
         """True while the factor of a job is taken in."""
@@ -81,8 +81,9 @@ class BatchIntake:
 
     # ---- in the thread of messages -------------------------------------------------------------------------
 
-    def _serve(self) -> None:
-        while True:
+    def run(self) -> None:
+        """Takes messages in until the session is closed."""
+        while self._room.acquire():
             try:
                 sample = self._ring.recv()
             except zenoh.ZError:  # the session was closed
@@ -150,6 +151,7 @@ class BatchIntake:
         """Takes all messages that have come, also those that wait for the thread, before a worker is forgotten."""
         with self._working:
             while (sample := self._ring.try_recv()) is not None:
+                self._room.acquire(blocking=False)
                 self._take_in(sample)
         self.take(self.done)
 
@@ -157,15 +159,17 @@ class BatchIntake:
         """Takes the factors of the oldest messages, unless their jobs are over, and notes why others did not pass."""
         for _ in range(count):
             arrived = self._done.popleft()
+            self._room.release()
             if isinstance(arrived, Refused):
                 self._counters.refuse(arrived)
                 continue
-            self._book.registry.mark_seen(arrived.message.worker, arrived.at)
-            numbers = {job.number for job in arrived.jobs}
-            others = self._matched(arrived) if arrived.others else []
-            self._beside -= numbers
-            if jobs := [*arrived.jobs, *(job for _, job in others)]:
-                self._answers.guarded(jobs, partial(self._take, arrived, others))
+            try:
+                self._book.registry.mark_seen(arrived.message.worker, arrived.at)
+                others = self._matched(arrived) if arrived.others else []
+                if jobs := [*arrived.jobs, *(job for _, job in others)]:
+                    self._answers.guarded(jobs, partial(self._take, arrived, others))
+            finally:
+                self._beside.difference_update(job.number for job in arrived.jobs)
 
     def _matched(self, arrived: Arrived) -> list[tuple[int, InFlightJob]]:
         """Returns place and job of the other answers that are of a job in flight and the first to it."""

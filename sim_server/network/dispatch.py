@@ -97,6 +97,10 @@ class Dispatch(FactorSource):
         """Number of factors that are taken in beside the caller. A probe for tests."""
         return self._intake.decoded
 
+    def take_in_batches(self) -> None:
+        """Takes in messages of several factors, beside the caller of all else, until the session is closed."""
+        self._intake.batches.run()
+
     def wake_by(self, wake: Callable[[], None]) -> None:
         """Has `wake` called, in another thread, when a factor that is taken in beside the caller is there."""
         self._intake.wake_by(wake)

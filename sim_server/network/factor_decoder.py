@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
 """Checks and decodes what workers send: patterns of L, and factors as bytes or in a slot of shared memory."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from functools import cache
+from functools import cache, lru_cache
 from typing import TypeVar
 from weakref import WeakValueDictionary
 
@@ -217,7 +217,7 @@ class FactorDecoder:
         message = parse(FactorBatch, attachment, CHANNELS["factors"].limit)
         check_header(message, incarnation=self._incarnation)
         check_strings(message, 256)
-        if message.worker != name_in("factors", key, "worker"):
+        if message.worker != _worker_in(str(key)):
             raise Refused(f"FactorBatch.worker is {message.worker[:80]!r}, its key is {key}", "worker")
         count = len(message.jobs)
         lengths = {name: len(getattr(message, name)) for name in ("patterns", "nonzeros", "checksums", "seconds")}
@@ -240,19 +240,24 @@ class FactorDecoder:
         seconds: float, remedy: str,
     ) -> Factor:  # fmt: skip
         """Returns the factor of values that were checked."""
-        self.note_size(known, pattern, job.object, job.method)
+        self.note_sizes([job.object], [known], pattern, job.method)
         return Factor(job.object, job.epoch, job.step, job.warp, pattern, values, job.worker, seconds, remedy[:200])
 
-    def note_size(self, known: AnnouncedObject, pattern: FactorPattern, object: str, method: str) -> None:
-        """Takes note of the pattern of a factor that was checked."""
-        if object in self._unsized:
-            self._unsized.discard(object)
-        if method != COMPLETE:
-            sizes = known.sizes.get(method, {})
+    def note_sizes(
+        self, objects: Sequence[str], known: Sequence[AnnouncedObject], pattern: FactorPattern, method: str
+    ) -> None:  # fmt: skip
+        """Takes note of the pattern of factors that were checked. known: what is known of their objects"""
+        if self._unsized:
+            self._unsized.difference_update(objects)
+        if method == COMPLETE:
+            for complete in {id(each.complete): each.complete for each in known}.values():
+                if pattern.id not in complete.sizes:
+                    self._share(complete, pattern)
+            return
+        for each in known:
+            sizes = each.sizes.get(method, {})
             if pattern.id not in sizes:
-                known.sizes[method] = _with_last(sizes, pattern.id, pattern.nonzeros)
-        elif pattern.id not in known.complete.sizes:
-            self._share(known.complete, pattern)
+                each.sizes[method] = _with_last(sizes, pattern.id, pattern.nonzeros)
 
     def on_rejected(self, object: str, pattern: int) -> None:
         """Takes note that a factor of a pattern did not pass the check: until another one comes, no room is made for
@@ -319,6 +324,12 @@ def _with_last(entries: dict[int, T], id: int, value: T) -> dict[int, T]:
 def _slot(job: InFlightJob) -> Slot:
     assert job.factor_slot is not None
     return job.factor_slot
+
+
+@lru_cache(maxsize=256)
+def _worker_in(key: str) -> str:
+    """Returns the worker that a message of factors is of, by its key."""
+    return name_in("factors", key, "worker")
 
 
 @cache

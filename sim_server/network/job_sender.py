@@ -1,12 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""Sends jobs to workers: alone or in batches, with slots of shared memory for what fits."""
+"""Sends jobs to the workers that are chosen: in batches (batch_sender.py), or alone, with slots for what fits."""
 
-import time
-from collections import deque
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from functools import cache, partial
-from operator import attrgetter
+from collections.abc import Mapping, Sequence
+from functools import partial
 
 import numpy as np
 import zenoh
@@ -14,37 +10,27 @@ import zenoh
 from protocol.channels import PART_BYTES, WHOLE_PARTS, key
 from protocol.counters import Counters
 from protocol.factor import FactorPattern
-from protocol.messages_pb2 import Matrix, MatrixBatch
+from protocol.messages_pb2 import Matrix
 from protocol.method import COMPLETE, Method
 from protocol.shared_memory.limits import SLOT_SHARE
 from protocol.shared_memory.pool import Slot, SlotPool
-from sim_server.arrays import Float64
 from sim_server.backends.shared_memory import PlacedMatrix
-from sim_server.network.batch_message import MOST_TOGETHER, BatchLayout, batch_message, fill, most_values
+from sim_server.network.batch_message import BatchLayout, most_values
+from sim_server.network.batch_sender import BatchSender
 from sim_server.network.bookkeeping import Bookkeeping
 from sim_server.network.device_slots import DeviceSlot, DeviceSlots
 from sim_server.network.factor_decoder import AnnouncedObject
 from sim_server.network.job_message import add_values, matrix_message
 from sim_server.network.jobs_in_flight import JobsInFlight
 from sim_server.network.send_queue import SendQueue
+from sim_server.network.sending import Sending
 from sim_server.network.worker_choice import WorkerChoice
 from sim_server.updates.factor_source import Job
 from sim_server.updates.jobs_together import JobsTogether
 
-FAST_SEND = 0.05  # s in which a fast link takes a job as bytes; zenoh drops what is not taken within 0.25 s
-BEHIND = 10.0  # s of a lease, at most, for what waits at a worker behind a first job, which has a longer one
 LEAST_ON_DEVICE = 1 << 20
 """Bytes of a factor; what has no more crosses the host in less time than the device needs to answer."""
-SHAPE, DTYPE, FLOAT64 = attrgetter("shape"), attrgetter("dtype"), np.dtype(np.float64)  # of matrices
 SLOT_MARGIN = 8  # the slot for an incomplete factor is larger than the largest factor so far by a SLOT_MARGIN-th
-
-
-@dataclass
-class Filling:
-    """Slots of a batch that the thread of the queue fills and sends; `over` once it has."""
-
-    slots: tuple[Slot, Slot]
-    over: bool = False
 
 
 class JobSender:
@@ -60,25 +46,10 @@ class JobSender:
         self, session: zenoh.Session, server: str, incarnation: int, pool: SlotPool | None, queue: SendQueue,
         counters: Counters, book: Bookkeeping, choice: WorkerChoice,
     ):  # fmt: skip
-        self._session, self._server, self._incarnation = session, server, incarnation
-        self._pool, self._queue, self._counters = pool, queue, counters
-        self._book, self._choice = book, choice
-        self._filling: deque[Filling] = deque()  # oldest first
-        self._fast_links: set[str] = set()  # workers without shared memory whose link takes a job at once
-
-    def forget_link(self, worker: str) -> None:
-        """Takes the link to a worker for slow until it shows that it is fast."""
-        self._fast_links.discard(worker)
-
-    def give_back_sent(self) -> None:
-        """Gives back slots that the thread of the queue needs no more: they are free once their jobs are over, too."""
-        while self._filling and self._filling[0].over:
-            self._give_back(self._filling.popleft().slots)
-
-    def _give_back(self, slots: Sequence[Slot]) -> None:
-        if self._pool is not None:
-            for slot in slots:
-                self._pool.give_back(slot)
+        self._sending = Sending(session, server, incarnation, queue, counters, book)
+        self._pool, self._counters, self._book, self._choice = pool, counters, book, choice
+        self._batches = BatchSender(self._sending, pool, self._send_alone)
+        self.forget_link, self.give_back_sent = self._sending.forget_link, self._batches.give_back_sent
 
     def submit(self, job: Job) -> bool:
         """Sends a job alone; False if no worker has room or the object has a job in flight."""
@@ -97,12 +68,12 @@ class JobSender:
         """
         rooms = dict(rooms) if len(jobs) > 1 else {}
         able = {name for name, room in rooms.items() if room > 1 and self._choice.takes_batches(name)}
-        failing = bool(self._book.reliability.failing_objects)
-        if isinstance(jobs, JobsTogether) and len(rooms) == len(able) == 1 and not failing:
+        failing = self._book.reliability.failing_objects
+        if isinstance(jobs, JobsTogether) and len(rooms) == len(able) == 1 and failing.isdisjoint(jobs.objects):
             (worker,) = able
-            if (told := self._layout_of(fitting := jobs[: rooms[worker]])) is not None:
-                return self._send_batches(worker, fitting, told) + [False] * (len(jobs) - len(fitting))
-        return self.submit_sorted(jobs, rooms, able, failing)
+            if (told := self._batches.layout_of(fitting := jobs[: rooms[worker]])) is not None:
+                return self._batches.send(worker, fitting, told) + [False] * (len(jobs) - len(fitting))
+        return self.submit_sorted(jobs, rooms, able, bool(failing))
 
     def submit_sorted(
         self, jobs: Sequence[Job], rooms: dict[str, int], able: set[str], failing: bool
@@ -128,37 +99,10 @@ class JobSender:
         for (worker, _), places in batches.items():
             together = JobsTogether.of([jobs[k] for k in places])
             told = BatchLayout.of([known[k] for k in places], together.method.name, together.dtype)
-            sent = self._send_batches(worker, together, told)
+            sent = self._batches.send(worker, together, told)
             for place, well in zip(places, sent, strict=True):
                 taken[place] = well
         return taken
-
-    def _layout_of(self, jobs: JobsTogether) -> BatchLayout | None:
-        """Returns the layout of jobs if all of them may share batches, as those of many small bodies do; None: they may
-        not."""
-        objects, flying = self._book.decoder.objects, self._book.leases.by_object
-        if not flying.keys().isdisjoint(jobs.objects) or len(set(jobs.objects)) < len(jobs):
-            return None
-        first, method = objects.get(jobs.objects[0]), jobs.method.name
-        if (
-            first is not None
-            and list(map(first.complete.epochs.get, jobs.objects)) == jobs.epochs
-            and method == COMPLETE
-        ):
-            told = BatchLayout.of_alike(first, len(jobs), jobs.dtype)
-        else:
-            known = [each for each in map(objects.get, jobs.objects) if each is not None]
-            if [each.epoch for each in known] != jobs.epochs:
-                return None
-            told = BatchLayout.of(known, method, jobs.dtype)
-        shapes = [(blocks, 3, 3) for blocks in told.blocks]
-        fit = shapes == list(map(SHAPE, jobs.values)) and set(map(DTYPE, jobs.values)) == {FLOAT64}
-        return told if fit and told.rooms.all() else None
-
-    def _send_batches(self, worker: str, jobs: JobsTogether, told: BatchLayout) -> list[bool]:
-        """Sends jobs to a worker in as few messages as they fit into."""
-        parts = [slice(k, k + MOST_TOGETHER) for k in range(0, len(jobs), MOST_TOGETHER)]
-        return [sent for part in parts for sent in self._send_batch(worker, jobs[part], told.part(part))]
 
     def _check(self, job: Job) -> AnnouncedObject:
         """Returns what is known of the object of a job. Raises ValueError for one that is not of its epoch or shape."""
@@ -180,49 +124,6 @@ class JobSender:
             able = self._choice.candidates(able, job.object)
         return self._choice.choose(able, job.object, rooms) if able else None
 
-    # ---- a batch ---------------------------------------------------------------------------------------------
-
-    def _send_batch(self, worker: str, jobs: JobsTogether, told: BatchLayout) -> list[bool]:
-        """Sends jobs to a worker in one message, or one by one if there are no slots for them together."""
-        leases, slots = self._book.leases, self._allocate_batch(told) if len(jobs) > 1 else None
-        if slots is None:
-            return [self._send_alone(worker, job) for job in jobs]
-        seconds, periods = leases.terms.of_all(jobs.objects, told.blocks, worker, jobs.method.name)
-        batch = self._begin(worker, jobs, seconds, periods)
-        batch.first, batch.rooms, batch.matrices, batch.bodies = told.first, told.rooms, jobs.values, jobs.bodies
-        batch.slots, batch.factor_slot, batch.factor_generation = slots, slots[1], slots[1].generation
-        leases.start(batch)
-        message = partial(batch_message, batch, told, seconds.tolist(), jobs.method, self._incarnation, *slots)
-        if self._queue.post(partial(self._fill_and_put, message, batch, filling := Filling(slots))):
-            self._filling.append(filling)
-            self._on_sent(batch, 72 * sum(told.blocks))
-            return [True] * len(jobs)
-        leases.cancel(batch.jobs)
-        self._give_back(slots)
-        return [False] * len(jobs)
-
-    def _fill_and_put(self, message: Callable[[], MatrixBatch], batch: JobsInFlight, filling: Filling) -> None:
-        """Makes the message of a batch, copies its matrices and sends them, in the thread of the queue. The slots are
-        not lent again meanwhile."""
-        slot, name = filling.slots[0], key("matrices", self._server, worker=batch.worker)
-        try:
-            fill(made := message(), batch.matrices, slot)
-            self._put(batch, name, slot.payload, made.SerializeToString(), True)
-        finally:
-            filling.over = True
-
-    def _allocate_batch(self, told: BatchLayout) -> tuple[Slot, Slot] | None:
-        """Allocates a slot for matrices and one for factors; None if there is not enough shared memory."""
-        assert self._pool is not None
-        users = len(told.blocks) + 1  # and the thread that sends them
-        matrices = self._pool.lend(72 * sum(told.blocks), users)
-        factors = self._pool.lend(told.bytes, users)
-        if matrices is not None and factors is not None:
-            return matrices, factors
-        for slot in filter(None, (matrices, factors)):
-            self._pool.give_back(slot, users)
-        return None
-
     # ---- a job alone -----------------------------------------------------------------------------------------
 
     def _send_alone(self, worker: str, job: Job) -> bool:
@@ -235,11 +136,16 @@ class JobSender:
         batch.factor_slot, batch.factor_generation = factor_slot, factor_slot.generation if factor_slot else 0
         batch.payload_bytes = 0 if matrix_slot else job.values.nbytes
         self._book.leases.start(batch)
-        message = matrix_message(batch.jobs[0], known, self._incarnation, lease, job.method)
+        message = matrix_message(batch.jobs[0], known, self._sending.incarnation, lease, job.method)
         payload = add_values(message, job.values, matrix_slot)
-        name, attachment = key("matrix", self._server, worker=worker, object=job.object), message.SerializeToString()
-        if self._queue.post(lambda: self._put(batch, name, payload, attachment, matrix_slot is not None)):
-            self._on_sent(batch, job.values.nbytes)
+        name, attachment = (
+            key("matrix", self._sending.server, worker=worker, object=job.object),
+            message.SerializeToString(),
+        )
+        if self._sending.queue.post(
+            lambda: self._sending.put(batch, name, payload, attachment, matrix_slot is not None)
+        ):
+            self._sending.on_sent(batch, job.values.nbytes)
             return True
         self._book.leases.cancel(batch.jobs)
         return False
@@ -258,10 +164,10 @@ class JobSender:
         batch, lease = self._begin_alone(worker, job, known)
         batch.slots, batch.device_slot, batch.device_generation = (matrix, factor), factor, factor.generation
         leases.start(batch)
-        message = matrix_message(batch.jobs[0], known, self._incarnation, lease, job.method)
+        message = matrix_message(batch.jobs[0], known, self._sending.incarnation, lease, job.method)
         message.device_matrix.CopyFrom(matrix.message())
-        if self._queue.post(partial(self._put_on_device, batch, job, message, matrix)):
-            self._on_sent(batch, job.values.nbytes)
+        if self._sending.queue.post(partial(self._put_on_device, batch, job, message, matrix)):
+            self._sending.on_sent(batch, job.values.nbytes)
             return True
         leases.cancel(batch.jobs)
         return False
@@ -273,8 +179,8 @@ class JobSender:
         for slot, told in ((matrix, message.device_matrix), (factor, message.device_factor)):
             device.mark(slot, told.generation)
         device.memory.put(matrix.address, [PlacedMatrix(job.values, job.on_device)])
-        name = key("matrix", self._server, worker=batch.worker, object=job.object)
-        self._put(batch, name, zenoh.ZBytes(b""), message.SerializeToString(), True)
+        name = key("matrix", self._sending.server, worker=batch.worker, object=job.object)
+        self._sending.put(batch, name, zenoh.ZBytes(b""), message.SerializeToString(), True)
 
     def _allocate(self, worker: str, job: Job) -> tuple[Slot | None, Slot | None]:
         """Allocates slots for the matrix and its factor; None for an array that must travel as bytes, as the first
@@ -308,57 +214,11 @@ class JobSender:
         if self.device is not None and size > LEAST_ON_DEVICE and self._choice.shares_device(worker):
             self.device.prepare([72 * self._book.decoder.objects[object].blocks, size])
 
-    # ---- both ------------------------------------------------------------------------------------------------
-
     def _begin_alone(self, worker: str, job: Job, known: AnnouncedObject) -> tuple[JobsInFlight, float]:
         """Makes the batch of a job alone, with the time [s] that its worker has."""
         terms = self._book.leases.terms
         lease = terms.lease(job.object, worker, job.method.name, job.positions, known.blocks)
         period = terms.exclusive_period(job.object, known.blocks)
-        batch = self._begin(worker, JobsTogether.of([job]), np.array([lease]), np.array([period]))
+        batch = self._sending.begin(worker, JobsTogether.of([job]), np.array([lease]), np.array([period]))
         batch.positions, batch.part_bytes = job.positions, PART_BYTES
         return batch, lease
-
-    def _begin(self, worker: str, jobs: JobsTogether, seconds: Float64, periods: Float64) -> JobsInFlight:
-        """Makes the batch of jobs that are being sent together, still without slots.
-
-        seconds: that the worker has for each, longer behind jobs that have longer. periods: exclusive ones [s]
-        """
-        now, leases = self._book.clock(), self._book.leases
-        behind = np.maximum(leases.deadlines().get(worker, 0.0) - now, np.maximum.accumulate(seconds))
-        deadlines = now + np.maximum(seconds, np.minimum(behind, BEHIND))
-        return JobsInFlight(
-            worker, _dtype_name(jobs.dtype), jobs.method.name, leases.next_numbers(len(jobs)), jobs.objects,
-            jobs.epochs, jobs.steps, jobs.warps, deadlines, now + periods, now,
-        )  # fmt: skip
-
-    def _on_sent(self, batch: JobsInFlight, size: int) -> None:
-        """Takes note of a batch whose matrices have so many bytes."""
-        self._book.last_worker.update(dict.fromkeys(batch.objects, batch.worker))
-        self._book.reliability.on_sent(batch.worker, self._book.clock())
-        self._counters.add("jobs", len(batch))
-        self._counters.add("bytes_out", size)
-
-    def _put(self, batch: JobsInFlight, name: str, payload: zenoh.ZBytes, attachment: bytes, shared: bool) -> None:
-        """Sends a job or a batch of them, in the thread of the send queue. If a link is full, zenoh drops it or blocks.
-
-        A dropped job ends its lease. zenoh blocks only for bytes over a link that is not known to be fast, since a
-        slow link takes longer than zenoh would keep them. While it blocks for one receiver all others wait too, even
-        for a receiver that subscribed to everything and stopped reading. The priority is one of its own, since a
-        blocked message locks the queue of its priority.
-        """
-        worker = batch.worker
-        drop = shared or worker in self._fast_links
-        control = zenoh.CongestionControl.DROP if drop else zenoh.CongestionControl.BLOCK
-        begin = time.perf_counter()
-        self._session.put(
-            name, payload, attachment=attachment, congestion_control=control, priority=zenoh.Priority.BACKGROUND
-        )
-        if not drop and time.perf_counter() - begin < FAST_SEND:
-            self._fast_links.add(worker)
-        batch.put_at = self._book.clock()
-
-
-@cache
-def _dtype_name(dtype: str) -> str:
-    return np.dtype(dtype).name

@@ -5,7 +5,7 @@ Pure bookkeeping, without network or clock.
 """
 
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from operator import attrgetter
 from typing import Protocol
 
@@ -73,8 +73,7 @@ class Leases:
         jobs = self.by_worker.get(worker, {})
         for job in dropped:
             jobs.pop(job.number, None)
-        latest = max(float(batch.deadlines.max()) for batch in set(map(BATCH, dropped)))
-        if self._deadlines is not None and latest >= self._deadlines.get(worker, latest):
+        if self._deadlines is not None and (latest := _latest(dropped)) >= self._deadlines.get(worker, latest):
             self._deadlines = None  # the latest one may be another now
         if not jobs:
             self.by_worker.pop(worker, None)
@@ -218,10 +217,10 @@ class Leases:
         return lost
 
     def deadlines(self) -> dict[str, float]:
-        """End of the lease [s, monotonic] of each busy worker."""
+        """End of the lease [s, monotonic] of each busy worker: the latest one of the messages with jobs in flight."""
         if self._deadlines is None:
             every = self.by_worker.items()
-            self._deadlines = {worker: max(job.deadline for job in jobs.values()) for worker, jobs in every}
+            self._deadlines = {worker: _latest(jobs.values()) for worker, jobs in every}
         return self._deadlines
 
     def _free_expired(self, worker: str, number: int) -> None:
@@ -237,3 +236,8 @@ class Leases:
             for batch, users in Counter(map(BATCH, jobs)).items():  # whose slots they share
                 for slot in batch.slots:
                     self._allocator.give_back(slot, users)
+
+
+def _latest(jobs: Iterable[InFlightJob]) -> float:
+    """End of the last lease of the batches of jobs [s, monotonic]."""
+    return max(float(batch.deadlines.max()) for batch in set(map(BATCH, jobs)))

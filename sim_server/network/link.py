@@ -119,6 +119,7 @@ class ServerLink:
         self.dispatch = Dispatch(
             session, self.name, self.incarnation, self._pool, self._job_queue, self.counters, silence, clock
         )
+        self._session.thread("factors of messages", self.dispatch.take_in_batches)
         self._queryables = Queryables(
             self._session, self.name, self.incarnation, self.counters, probe_slot, self._reply_queue, self._claim,
             self._rights,

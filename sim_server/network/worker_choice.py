@@ -116,7 +116,7 @@ class WorkerChoice:
         """Number of busy workers that would finish one more job before the fastest idle one could."""
         now, book = self._book.clock(), self._book
         idle = [(name, now - book.free_since.get(name, 0.0)) for name in self.open()]
-        if len(idle) == len(book.available()):
+        if not idle or len(idle) == len(book.available()):
             return 0
         full = {name for name in book.leases.by_worker if not self.room(name)}
         busy = [(j.worker, j.object, now - j.sent_at) for j in book.leases.jobs if j.worker in full]

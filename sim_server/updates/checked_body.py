@@ -2,7 +2,9 @@
 """What native code needs to check factors (backends/cpu/native/factor_check.cpp): its library, and bodies."""
 
 import ctypes as c
+from collections.abc import Sequence
 from functools import cache
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,17 +38,29 @@ def sharing_threads(factors: int) -> int:
     return 1 + min(helping_threads(), factors // FEW)
 
 
+class CheckedBodies(NamedTuple):
+    """What the check needs of the objects of some factors, by columns.
+
+    columns: addresses of row_start, columns, probe vector and pattern of the factor of each, and its nodes, (k, 5)
+    kept: what they are addresses of
+    """
+
+    columns: NDArray[np.uintp]
+    kept: Sequence["CheckedBody"]
+
+
 class CheckedBody:
     """What the check needs of an object: its pattern, that of its factor, and where native code finds them.
 
-    addresses: of row_start, columns, the probe vector and the pattern of the factor
+    row: of the table of those that are known
+    native: a row of CheckedBodies.columns
     """
 
-    def __init__(self, row_start: Int32, columns: Int32, probe: NDArray[np.float64], pattern: FactorPattern):
-        self.row_start, self.columns, self.probe, self.pattern = row_start, columns, probe, pattern
+    def __init__(self, row_start: Int32, columns: Int32, probe: NDArray[np.float64], pattern: FactorPattern, row: int):
+        self.row_start, self.columns, self.probe, self.pattern, self.row = row_start, columns, probe, pattern, row
         self.nodes, self.nonzeros, self._native = len(row_start) - 1, pattern.nonzeros, NativePattern(pattern)
         arrays = (each.ctypes.data for each in (row_start, columns, probe))
-        self.addresses = (*arrays, c.addressof(self._native.native))
+        self.native = (*arrays, c.addressof(self._native.native), self.nodes)
 
     def fits(self, row_start: Int32, columns: Int32, pattern: FactorPattern) -> bool:
         """True if the arrays are still those."""

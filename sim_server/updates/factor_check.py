@@ -7,7 +7,7 @@ all of it; a factor that takes off less than block Jacobi does is worth less tha
 """
 
 import threading
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -15,8 +15,9 @@ from numpy.typing import NDArray
 
 from protocol.factor import Factor, FactorPattern
 from protocol.shared_memory.located import Located, address, addresses
+from sim_server.arrays import Int32
 from sim_server.backends.factors_together import FactorsTogether
-from sim_server.updates.checked_body import FACTOR, WORK, CheckedBody, library, sharing_threads
+from sim_server.updates.checked_body import FACTOR, WORK, CheckedBodies, CheckedBody, library, sharing_threads
 from sim_server.updates.patterns import Patterns
 
 Reals = NDArray[np.float64]
@@ -50,7 +51,7 @@ def _within_limits(zr: Any, reduction: Any, block_jacobi: Any, residual: Any) ->
 class Checked(NamedTuple):
     """Factors that are checked, by columns. matrices: values (blocks, 3, 3) that each was made from; None: not known"""
 
-    bodies: Sequence[CheckedBody]
+    bodies: CheckedBodies
     values: Sequence[NDArray[Any]]
     matrices: Sequence[Reals | None]
 
@@ -68,7 +69,9 @@ class FactorCheck:
         self._patterns, self._alone = patterns if isinstance(patterns, Patterns) else Patterns(patterns), alone
         self._vectors: dict[int, Reals] = {}  # probe vectors by size
         self._work = np.empty(0)
+        self._working = threading.Lock()  # of this memory
         self._bodies: dict[str, CheckedBody] = {}  # by object
+        self._columns = np.zeros((64, 5), np.uintp)  # of these, by row
         self._lock = threading.Lock()  # of these
 
     def prepare(self) -> None:
@@ -101,20 +104,37 @@ class FactorCheck:
 
     def bodies(
         self, objects: Sequence[str], epochs: Sequence[int], patterns: Sequence[FactorPattern]
-    ) -> list[CheckedBody] | None:  # fmt: skip
-        """Returns what native code needs to check factors of some objects, each of a pattern (take_in.py); None if one
-        of them is not of the size of its object. From any thread."""
-        at, known, found = self._patterns.at, self._bodies, list[CheckedBody]()
+    ) -> CheckedBodies | None:  # fmt: skip
+        """Returns what native code needs to check factors of some objects, each of a pattern; None if one of them is
+        not of the size of its object. From any thread."""
+        known, at, same = self._bodies, self._patterns.at, not self._patterns.change
+        found: list[CheckedBody] = []
+        added = False
         with self._lock:
             for name, epoch, pattern in zip(objects, epochs, patterns, strict=True):
-                row_start, columns = at(name, epoch)
                 body = known.get(name)
-                if body is None or not body.fits(row_start, columns, pattern):
+                if body is None or body.pattern is not pattern or not (same or body.fits(*at(name, epoch), pattern)):
+                    row_start, columns = at(name, epoch)
                     if pattern.size != 3 * (len(row_start) - 1):
                         return None
-                    body = self._body(name, epoch, pattern)
+                    body, added = self._added(name, row_start, columns, pattern), True
                 found.append(body)
-        return found
+            rows = [body.row for body in found]
+            native = np.array([body.native for body in found], np.uintp) if added else self._columns[rows]
+            return CheckedBodies(native, found)
+
+    def _added(self, name: str, row_start: Int32, columns: Int32, pattern: FactorPattern) -> CheckedBody:
+        """Adds what is known of an object, in place of what was. With the lock."""
+        last = self._bodies.get(name)
+        body = CheckedBody(
+            row_start, columns, self._vector(3 * (len(row_start) - 1)), pattern,
+            len(self._bodies) if last is None else last.row,
+        )  # fmt: skip
+        self._bodies[name] = body
+        if body.row == len(self._columns):
+            self._columns = np.concatenate([self._columns, np.zeros_like(self._columns)])
+        self._columns[body.row] = body.native
+        return body
 
     def reject_together(self, factors: FactorsTogether, matrices: Sequence[Reals | None]) -> list[str]:
         """Returns what `reject_reasons` does, of factors that came together. matrices: that they were made from"""
@@ -189,7 +209,10 @@ class FactorCheck:
         factors, matrices = [factor for factor, _ in checked], [matrix for _, matrix in checked]
         objects, epochs = [f.object for f in factors], [f.epoch for f in factors]
         patterns, values = [f.pattern for f in factors], [f.values for f in factors]
-        given = Checked(self._known(objects, epochs, patterns), values, matrices)
+        bodies = self.bodies(objects, epochs, patterns)
+        if bodies is None:
+            raise ValueError("a factor is not of the size of its object")
+        given = Checked(bodies, values, matrices)
         if applied is None:
             return _probes(self._judge(given, WITH_FACTOR | WITH_BLOCK_JACOBI))
         unread = given._replace(values=[NO_VALUES] * len(values))  # those on a device would be copied
@@ -200,14 +223,14 @@ class FactorCheck:
     def _judge(self, checked: Checked, parts: int, applied: Reals | None = None) -> Reals:
         """Returns what wf_judge_all finds, (k, 5), 0 but for some parts. applied: P^-1 r of the only factor, whose
         values are not read then"""
-        with self._lock:
-            return self._judge_locked(checked, parts, applied)
+        with self._working:
+            return self._judge_alone(checked, parts, applied)
 
-    def _judge_locked(self, checked: Checked, parts: int, applied: Reals | None) -> Reals:
+    def _judge_alone(self, checked: Checked, parts: int, applied: Reals | None) -> Reals:
         bodies, values, matrices = checked
-        count, values = len(bodies), [_contiguous(each) for each in values]
-        row_start, columns, r, pattern = np.array([body.addresses for body in bodies], np.uintp).T.copy()
-        factors, nodes = np.zeros(count, FACTOR), np.array([body.nodes for body in bodies], np.int32)
+        count, values = len(values), [_contiguous(each) for each in values]
+        row_start, columns, r, pattern, sizes = bodies.columns.T.copy()
+        factors, nodes = np.zeros(count, FACTOR), sizes.astype(np.int32)
         factors["pattern"], factors["values"] = pattern, addresses(values)
         factors["bytes"] = [each.itemsize for each in values]
         threads, room = sharing_threads(count), WORK * 3 * int(nodes.max())
@@ -220,21 +243,6 @@ class FactorCheck:
         arrays = factors, nodes, row_start, columns, known, r, z, self._work, out
         library().wf_judge_all(count, parts, *map(address, arrays), room, threads)
         return out
-
-    def _known(
-        self, objects: Sequence[str], epochs: Sequence[int], patterns: Iterable[FactorPattern]
-    ) -> list[CheckedBody]:  # fmt: skip
-        """Returns what is known of the objects of some factors, which have their size."""
-        with self._lock:
-            return [self._body(*each) for each in zip(objects, epochs, patterns, strict=False)]
-
-    def _body(self, name: str, epoch: int, pattern: FactorPattern) -> CheckedBody:
-        row_start, columns = self._patterns.at(name, epoch)
-        known = self._bodies.get(name)
-        if known is None or not known.fits(row_start, columns, pattern):
-            known = CheckedBody(row_start, columns, self._vector(3 * (len(row_start) - 1)), pattern)
-            self._bodies[name] = known
-        return known
 
     def _vector(self, size: int) -> Reals:
         if size not in self._vectors:

@@ -97,8 +97,10 @@ class ManyFactors:
         driver, bodies = self._driver, self._bodies(factors)
         if any(reasons):
             return False
-        epochs = map(driver.source.epoch, factors.objects)
-        if any(told not in (None, own) for told, own in zip(epochs, factors.epochs, strict=True)):
+        epochs = list(map(driver.source.epoch, factors.objects))
+        if epochs != factors.epochs and any(
+            told not in (None, own) for told, own in zip(epochs, factors.epochs, strict=True)
+        ):
             return False
         workers, regularized = [factors.worker] * len(factors), [bool(remedy) for remedy in factors.remedies]
         made = MadeFactors(factors.steps, factors.seconds, workers, regularized)

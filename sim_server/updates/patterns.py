@@ -25,6 +25,11 @@ class Patterns:
         given = {b.name: system.body_pattern(b.first, b.last) for b in simulation.world.bodies}
         return cls(given, simulation.splits)
 
+    @property
+    def change(self) -> bool:
+        """True if objects may be split."""
+        return self._history is not None
+
     def at(self, name: str, epoch: int) -> Pattern:
         """Returns that of an object in an epoch."""
         return self._given[name] if self._history is None else self._history.pattern(name, epoch)

@@ -6,9 +6,6 @@ many were requested as there are idle workers, these would rest meanwhile: with 
 time.
 """
 
-import numpy as np
-
-from sim_server.arrays import Float64
 from sim_server.updates.stats import RunningMean
 
 MAX_DEPTH = 256  # matrices held at once
@@ -45,27 +42,18 @@ class PrefetchDepth:
         """Takes note of copies that could be sent so many seconds after their requests, in the mean."""
         self._copy.add(seconds)
 
-    def update(self, seconds: Float64, workers: int, queued: bool = False) -> None:
+    def update(self, seconds: float | None, bodies: int, workers: int, queued: bool = False) -> None:
         """Computes the depth.
 
-        seconds: of a factorization of each body, NaN: not known yet
+        seconds: of a factorization, in the mean of so many bodies; None: not known yet
         queued: several jobs wait at each worker, for which their transfer then takes no time
         """
         self.depth, self.queued = 0, queued
-        period, mean = self._period.value, _mean(seconds)
-        if mean is not None and period is not None:
+        period = self._period.value
+        if seconds is not None and period is not None:
             ahead = max(period, self._copy.value or 0.0)
-            depth = workers * period / (mean + TRANSFER)
+            depth = workers * period / (seconds + TRANSFER)
             if queued:
-                depth = max(depth, min(MORE * workers * ahead / mean, len(seconds) / SHARE))
+                depth = max(depth, min(MORE * workers * ahead / seconds, bodies / SHARE))
             self.depth = min(int(depth), MAX_DEPTH)
             self.patience = MAX_WAIT + int(ahead / period) - 1 if period > 0 else MAX_WAIT
-
-
-def _mean(values: Float64) -> float | None:
-    """The mean of those that are not NaN; None: there is none."""
-    mean = float(values.mean())
-    if mean == mean:
-        return mean
-    known = values[~np.isnan(values)]
-    return float(known.mean()) if len(known) else None

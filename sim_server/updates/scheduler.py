@@ -19,7 +19,7 @@ from math import ceil, inf
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from protocol.shared_memory.located import address
 from sim_server.scene.solver_options import Rule
@@ -71,27 +71,29 @@ def pick(
     return bodies
 
 
-def round_duration(latencies: ArrayLike, jobs: float) -> float:
+def round_duration(latencies: float, jobs: float) -> float:
     """Returns the steps in which every body is served once; inf without workers.
 
-    latencies: steps from matrix to factor of each body
+    latencies: steps from matrix to factor, summed over all bodies
     jobs: that are on their way at a time, one at each worker at least; 0: there is no worker. Each ends after its
         latency, so that jobs / latency of them end in a step (Little 1961, A proof for the queuing formula L = λ W)
     """
-    return float(np.sum(latencies)) / jobs if jobs > 0 else inf
+    return latencies / jobs if jobs > 0 else inf
 
 
-def overdue_after(rounds: float, latencies: ArrayLike, jobs: float) -> float:
+def overdue_after(rounds: float, latencies: float, jobs: float) -> float:
     """Returns the steps after which a body goes next whatever the rule: `rounds` rounds, inf without workers."""
     return rounds * round_duration(latencies, jobs)
 
 
-def max_factor_age(overdue: float, latencies: ArrayLike, jobs: float) -> int:
+def max_factor_age(overdue: float, latencies: float, longest: float, jobs: float) -> int:
     """Returns a bound on the age of any factor in steps, -1 without workers.
 
     A body waits until it is overdue and then behind all the others, and its matrix is copied, factorized and taken
     up while the factor before is still in use.
+
+    longest: of the latencies
     """
-    if jobs <= 0 or not np.size(latencies):
+    if jobs <= 0 or not latencies:
         return -1
-    return ceil(overdue + round_duration(latencies, jobs) + 2 * float(np.max(latencies)) + 2)
+    return ceil(overdue + round_duration(latencies, jobs) + 2 * longest + 2)

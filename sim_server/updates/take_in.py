@@ -19,20 +19,20 @@ from protocol.validate import checksum
 from sim_server.arrays import Float64
 from sim_server.backends.cpu.factors import NativePattern
 from sim_server.backends.factors_together import FactorsTogether
-from sim_server.updates.checked_body import ARRIVING, WORK, CheckedBody, library, sharing_threads
+from sim_server.updates.checked_body import ARRIVING, WORK, CheckedBodies, library, sharing_threads
 
-SHARED = 4 << 20  # bytes from where on threads share the work: a millisecond, of which they take a tenth to start
+SHARED = 1 << 19  # bytes from where on threads share the work: a millisecond, of which they take a tenth to start
 
 
 class SentMatrices(NamedTuple):
     """What factors that arrive are checked with.
 
-    bodies, matrices: of each factor, the body and values (blocks, 3, 3) of the matrix that was sent
+    bodies, matrices: of each factor; values (blocks, 3, 3) of the matrix that was sent
     responses: address of the function that finds the largest response (inverse/digits.py); 0: nobody asks for it
     end: takes note of what was found about some of them: (factors, their rows)
     """
 
-    bodies: Sequence[CheckedBody]
+    bodies: CheckedBodies
     matrices: Sequence[Float64]
     responses: int
     end: Callable[[FactorsTogether, "TakenIn"], None]
@@ -68,7 +68,10 @@ def take_in(
 
     source: may be written to meanwhile; what is returned is about the copies
     """
-    nonzeros = np.array([pattern.nonzeros for pattern in patterns], np.int64)
+    kinds = dict.fromkeys(patterns)
+    nonzeros = np.full(len(patterns), patterns[0].nonzeros, np.int64)
+    if len(kinds) > 1:
+        nonzeros[:] = [pattern.nonzeros for pattern in patterns]
     ends, item = np.cumsum(nonzeros), memory.itemsize
     if memory.dtype not in (np.float32, np.float64) or ends[-1] != memory.size or not memory.flags.c_contiguous:
         raise ValueError(f"{memory.size} numbers of {memory.dtype} for {ends[-1]}")
@@ -78,12 +81,11 @@ def take_in(
     each["target"] = address(memory) + (ends - nonzeros) * item
     room, responses, natives = 0, 0, dict[FactorPattern, NativePattern]()
     if sent is None:
-        natives = {pattern: NativePattern(pattern) for pattern in dict.fromkeys(patterns)}
+        natives = {pattern: NativePattern(pattern) for pattern in kinds}
         each["pattern"] = [c.addressof(natives[pattern].native) for pattern in patterns]
     else:
-        places = np.array([body.addresses for body in sent.bodies], np.uintp)
-        each["row_start"], each["columns"], each["r"], each["pattern"] = places.T
-        each["matrix"], each["nodes"] = addresses(sent.matrices), [body.nodes for body in sent.bodies]
+        each["row_start"], each["columns"], each["r"], each["pattern"], each["nodes"] = sent.bodies.columns.T
+        each["matrix"] = addresses(sent.matrices)
         room, responses = WORK * 3 * int(each["nodes"].max()), sent.responses
     threads = sharing_threads(len(patterns)) if memory.nbytes > SHARED else 1
     work, hashing = np.empty(threads * room), hash_address()

@@ -148,6 +148,15 @@ void wf_factors(const Table* t, const int64_t* body, const int64_t* made, const 
     }
 }
 
+// Returns the mean of those numbers of a column that are known; NaN: none is.
+double wf_mean(const double* column, int64_t bodies) {
+    double sum = 0;
+    int64_t known = 0;
+    for (int64_t b = 0; b < bodies; ++b)
+        if (!std::isnan(column[b])) sum += column[b], ++known;
+    return known ? sum / known : NAN;
+}
+
 // Counts bodies whose copy is requested or waits to be sent, those with a job at a worker or a factor that is checked, and those with
 // jobs that failed since their last factor.
 void wf_count(const Table* t, int64_t* counts) {

@@ -93,7 +93,8 @@ def library() -> Any:
     Raises CompileError."""
     i, n, p = c.c_int32, c.c_int64, c.c_void_p
     signatures: dict[str, tuple[Any, list[Any]]] = {
-        "wf_told": (i, [p, n]), "wf_observe": (i, [p, p, n, i]), "wf_count": (None, [p, p]), "wf_copying": (n, [p, p]),
+        "wf_told": (i, [p, n]), "wf_mean": (c.c_double, [p, n]),
+        "wf_observe": (i, [p, p, n, i]), "wf_count": (None, [p, p]), "wf_copying": (n, [p, p]),
         "wf_requests": (n, [p, n, i, p, p, p]), "wf_factors": (None, [p, p, p, p, n, n, p]),
         "wf_pick": (n, [p, n, n, n, i, c.c_double, p]),
     }  # fmt: skip
@@ -180,6 +181,11 @@ class UpdateTable:
         library().wf_count(self._native, address(self._counts))
         copying, flying, failing = self._counts.tolist()
         return copying, flying, failing
+
+    def mean(self, column: Float64) -> float | None:
+        """Returns the mean of those numbers of a column of this table that are known; None: none is."""
+        mean = float(library().wf_mean(address(column), len(self)))
+        return None if mean != mean else mean
 
     def in_order_of_requests(self) -> Int64:
         """Returns the bodies whose copy is requested or waits to be sent, in the order of the requests."""

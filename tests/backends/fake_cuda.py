@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim_server.backends.compiler import INCLUDE, SOURCES, compiler
+from sim_server.backends.declarations import Declarations
 from sim_server.backends.gpu import structs
 from sim_server.backends.gpu.loop import CAPACITY, GRAPH_STEPS, DeviceLoop
 from sim_server.backends.gpu.solver import PCG_RESULT
@@ -28,6 +29,7 @@ SIGNATURES = {
 Work = Callable[[], None]
 
 ELASTIC_GRAPH, BALANCE_GRAPH, RECORD_GRAPHS = 11, 12, (15, 16)  # handles of graphs
+COPY_GRAPHS = (17, 18, 19)  # of mail of both batches, and of matrices
 STEPS = dict(zip(range(5, 11), GRAPH_STEPS * 2, strict=True))  # of the graphs that step
 TIMED = (8, 9, 10)  # those that note the time first
 
@@ -135,6 +137,11 @@ class FakeDevice:
             assert self._one(self.stream) or self._one(self.copies), "nothing would ever end this wait"
         return 0
 
+    def finish_copies(self) -> None:
+        """Makes the copies to the host that wait for no step, beside the steps."""
+        while self._one(self.copies):
+            pass
+
     def _one(self, stream: int) -> bool:
         """Does one piece of work of a stream, if it may."""
         queue = self._queues[stream]
@@ -150,21 +157,21 @@ class FakeDevice:
 
 
 @cache
-def records_library() -> c.CDLL:
-    """The text of step_records.cu, run by threads of the processor."""
+def on_threads(declarations: Declarations, call: str, struct: str) -> c.CDLL:
+    """A kernel's text, run by threads of the processor: run(blocks, a). call: of the kernel. struct: of a"""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         text = f"""#include "cuda_threads.h"
-            {RECORDS.checked()}
-            extern "C" void write(int blocks, const StepRecords* a) {{
-                launch(blocks, THREADS, [&] {{ write_records(*a); }});
+            {declarations.checked()}
+            extern "C" void run(int blocks, const {struct}* a) {{
+                launch(blocks, THREADS, [&] {{ {call}; }});
             }}
             """
-        (folder / "records.cpp").write_text(text)
+        (folder / "kernel.cpp").write_text(text)
         paths = [f"-I{p}" for p in (Path(__file__).parent, SOURCES / "backends/gpu", INCLUDE)]
         command = [compiler(), "-std=c++17", "-O1", "-shared", "-fPIC", "-pthread", *paths]
-        subprocess.run([*command, str(folder / "records.cpp"), "-o", str(folder / "records.so")], check=True)
-        return c.CDLL(str(folder / "records.so"))
+        subprocess.run([*command, str(folder / "kernel.cpp"), "-o", str(folder / "kernel.so")], check=True)
+        return c.CDLL(str(folder / "kernel.so"))
 
 
 def write_records(results: NDArray, energies: NDArray, loop: structs.GpuLoop, target: int, blocks: int = 2) -> None:
@@ -173,7 +180,14 @@ def write_records(results: NDArray, energies: NDArray, loop: structs.GpuLoop, ta
     params["target"], params["results"], params["energies"] = target, results.ctypes.data, energies.ctypes.data
     params["records"], params["room"] = loop.records, loop.record_capacity
     params["capacity"], params["bodies"] = results.shape
-    records_library().write(blocks, c.c_void_p(params.ctypes.data))
+    on_threads(RECORDS, "write_records(*a)", "StepRecords").run(blocks, c.c_void_p(params.ctypes.data))
+
+
+def make_copies(launch: structs.CopyLaunch) -> None:
+    """Makes the copies of a list on the device."""
+    count, first = (c.c_int64 * 2).from_address(launch.target)
+    for copy in (structs.DeviceCopy * count).from_address(launch.target + first):
+        c.memmove(copy.target, copy.source, copy.bytes)
 
 
 class FakeScene:
@@ -189,7 +203,7 @@ class FakeScene:
         self.argument = np.zeros(1, np.int64)
         self.results, self.stamps = np.zeros((CAPACITY, bodies), PCG_RESULT), np.zeros(CAPACITY, STEP_TIMESTAMP)
         self.energies, self.phase = np.zeros((CAPACITY, bodies), ENERGY_RECORD), 0
-        self.found = 0
+        self.found, self.lasts = 0, 10  # ns of the first step; step k (from 0) lasts k + 1 times as long
         self.clock, self.time, self.done = np.zeros(1), 0, 0
         self.seen: list[int] = []  # the argument in each step
         boxes = [(a.ctypes.data + 8 * k, 8) for a in (self.settings, self.factor) for k in range(bodies)]
@@ -203,7 +217,9 @@ class FakeScene:
         device.graphs[BALANCE_GRAPH] = lambda: None  # steps tell their energies themselves
         for graph, target in zip(RECORD_GRAPHS, self.loop.targets, strict=True):
             device.graphs[graph] = partial(write_records, self.results, self.energies, self.loop.loop, target)
-        self.loop.use_graphs(list(STEPS), RECORD_GRAPHS, BALANCE_GRAPH, ELASTIC_GRAPH)
+        for graph, launch in zip(COPY_GRAPHS, self.loop.copy_launches, strict=True):
+            device.graphs[graph] = partial(make_copies, launch)
+        self.loop.use_graphs(list(STEPS), RECORD_GRAPHS, COPY_GRAPHS, BALANCE_GRAPH, ELASTIC_GRAPH)
 
     def _steps(self, steps: int, stamp: bool = False) -> None:
         if stamp:
@@ -229,7 +245,7 @@ class FakeScene:
         told["kinetic"], told["elastic"], told["work"], told["phase"] = k, np.nan, -k, self.phase
         told["found"] = self.found
         self.x[:], self.v[:] = k + 1, -k
-        self.time += 10 * (k + 1)
+        self.time += self.lasts * (k + 1)
         self.stamps[slot]["end"] = self.time
         self.stamps[(slot + 1) % CAPACITY]["begin"] = self.time
         self.done += 1

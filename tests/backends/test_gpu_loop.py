@@ -22,6 +22,7 @@ from sim_server.backends.rosenbrock import FORMS
 from sim_server.errors import DeviceLost
 from tests.backends.fake_cuda import (
     BALANCE_GRAPH,
+    COPY_GRAPHS,
     ELASTIC_GRAPH,
     NOT_READY,
     RECORD_GRAPHS,
@@ -803,3 +804,103 @@ def test_the_memory_of_copies_is_what_the_limit_of_memory_counts(monkeypatch, re
     scene.loop.prepare_copies()
     assert made == [loop_module.bytes_of_copies([2, 2, 2], real)]
     assert made == [(2 if doubled else 1) * 3 * 2 * 9 * np.dtype(real).itemsize]
+
+
+def transfers(scene: FakeScene) -> list[tuple[int, int]]:
+    """Copies of matrices to the host from now on: first byte of the memory of copies, and bytes."""
+    found: list[tuple[int, int]] = []
+    to_host = scene.device.to_host
+
+    def noted(to: int, source: int, count: int, stream: int) -> int:
+        found.append((to - int(scene.loop.loop.host_matrices), count))
+        return to_host(to, source, count, stream)
+
+    scene.device.set("to_host", noted)
+    return found
+
+
+def test_matrices_that_are_asked_together_are_copied_in_one_launch_and_come_in_one_transfer():
+    """Those of neighbours, in any order, whose last copies lie in places of the same number."""
+    scene, size = FakeScene(bodies=6), 2 * 72
+    scene.loop.run(20)
+    graphs, found = launched(scene), transfers(scene)
+    first = scene.loop.request_matrices(np.array([4, 2, 3]))
+    scene.loop.run(20)
+    assert graphs.count(COPY_GRAPHS[2]) == 1 and found == [(6 * size + 2 * size, 3 * size)]
+    found.clear()
+    second = scene.loop.request_matrices(np.array([0, 1, 2, 3, 5]))
+    scene.loop.run(20)
+    assert found == [(2 * size, 2 * size), (6 * size, 2 * size), (11 * size, size)]
+    assert graphs.count(COPY_GRAPHS[2]) == 2
+    assert all((each == 20).all() for each in first) and all((each == 40).all() for each in second)
+
+
+def test_all_mail_of_a_batch_is_delivered_in_one_launch_and_none_where_there_is_none():
+    scene = FakeScene(bodies=5)
+    scene.loop.run(20)
+    graphs = launched(scene)
+    for body, value in ((3, 7), (0, 8), (4, 9)):
+        scene.loop.mailboxes[body].post(number(value))
+    scene.loop.run(60)
+    assert sum(graph in COPY_GRAPHS for graph in graphs) == 1
+    records = scene.loop.records()
+    assert records["iterations"][-5:].tolist() == [8, 0, 0, 7, 9]
+
+
+def test_batches_are_shorter_while_matrices_and_mail_come_and_go():
+    lengths = []
+    for exchange in (True, False):
+        scene = FakeScene()
+        scene.loop.loop.batch_seconds, scene.loop.loop.exchange_seconds = 1.0, 1e-12
+        scene.loop.run(20)
+        if exchange:  # its event never comes
+            scene.loop.mailboxes[0].post(number(5), event=scene.device.event())
+        begun = int(scene.loop.loop.begun)
+        scene.loop.run(40)
+        lengths.append(40 / (int(scene.loop.loop.begun) - begun))
+        assert scene.loop.records()["step"].tolist() == list(range(1, 61))
+    assert lengths[0] == 1 and lengths[1] > 4
+
+
+def test_a_copy_that_has_arrived_is_published_while_the_next_batch_is_under_way():
+    """Without a wait for the end of that batch."""
+    scene = FakeScene()
+    loop, query = scene.loop.loop, scene.device.event_query
+    loop.batch_seconds = loop.exchange_seconds = 1e-12  # one step each
+    scene.loop.run(5)
+    scene.loop.request_matrix(0, np.zeros((2, 3, 3)))
+    published = []
+
+    def noted(event: int) -> int:
+        if scene.loop.step == 6 and event != loop.copied_event:  # the next batch is awaited
+            scene.device.finish_copies()
+        if scene.loop.matrix_step(0) >= 0:
+            published.append(scene.loop.step)
+        return query(event)
+
+    scene.device.set("event_query", noted)
+    scene.device.pieces, loop.energy_every = 1, 1  # a batch takes several queries
+    scene.loop.run(8)
+    assert published[0] == 6 and scene.loop.matrix_step(0) == 5
+
+
+@pytest.mark.parametrize(("lead", "first"), [(1e-4, 7), (1.0, 8)])
+def test_what_comes_while_a_batch_is_under_way_goes_with_the_next_one(lead, first):
+    """Unless that is launched long before its end: the mail comes when the sixth step is the only one under way."""
+    scene = FakeScene(bodies=2)
+    loop, query, posted = scene.loop.loop, scene.device.event_query, []
+    loop.batch_seconds = loop.exchange_seconds = 1e-12  # one step each
+    loop.lead, scene.lasts, scene.device.pieces = lead, 10_000_000, 1
+    scene.loop.mailboxes[1].post(number(3), event=scene.device.event())  # which never comes: more mail is expected
+    scene.loop.run(4)
+
+    def noted(event: int) -> int:
+        if scene.loop.step == 5 and not posted:
+            posted.append(scene.loop.mailboxes[0].post(number(9)))
+        return query(event)
+
+    scene.device.set("event_query", noted)
+    scene.loop.run(6)
+    records = scene.loop.records()
+    found = records[records["body"] == 0]
+    assert found["step"][np.flatnonzero(found["iterations"] == 9)[0]] == first

@@ -57,7 +57,7 @@ def test_the_compiler_agrees_with_all_that_the_loop_shares(tmp_path):
         ("elastic_energy.cu", ELASTIC_TEXT), ("step_epilogue.cu", EPILOGUE), ("stages.cuh", structs.STAGES),
         ("stage_decision.cu", DECISION), ("momentum.cu", MOMENTUM),
         ("contact_state.cuh", structs.CONTACT), ("contact.cu", CONTACT_TEXT),
-        ("measured.cu", MEASURED_TEXT), ("step_records.cu", structs.RECORDS),
+        ("measured.cu", MEASURED_TEXT), ("step_records.cu", structs.RECORDS), ("copy_list.cu", structs.COPIES),
         ("inverse/build_inverse.cu", INVERSE), ("inverse/apply_inverse.cu", APPLICATION),
     ],
     ids=lambda value: value if isinstance(value, str) else "layouts",

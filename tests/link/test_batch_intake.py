@@ -3,6 +3,7 @@
 
 import logging
 import queue
+import threading
 import time
 from collections.abc import Iterator
 from types import SimpleNamespace
@@ -64,6 +65,7 @@ class Stage:
         self.book = Bookkeeping(registry, self.leases, WorkerTiming(), reliability, self.decoder, time.monotonic)
         session: Any = SimpleNamespace(declare_subscriber=lambda *_: self.ring)
         self.intake = BatchIntake(session, "s", self.counters, self.book, Answers(self.counters, self.book))
+        threading.Thread(target=self.intake.run, daemon=True).start()
         self.leases.next_numbers(len(NAMES))
         self.leases.start(self.batch)
 
@@ -178,6 +180,31 @@ def test_an_error_while_a_message_is_taken_ends_its_jobs(stage, monkeypatch):
     stage.send()
     assert stage.take() == set() and stage.failed() == set(NAMES) and stage.leases.count("w") == 0
     assert stage.counters.refusals == {"unexpected": 1} and len(stage.intake) == 0
+
+
+def test_jobs_of_a_message_that_fails_as_it_is_taken_are_not_taken_in_any_more(stage, monkeypatch):
+    """Else their leases would never be over, and their objects never have a factor again."""
+    monkeypatch.setattr(BatchIntake, "_matched", lambda *_: {}["nose"])
+    stage.message.jobs[2] = 1 << 40
+    stage.send()
+    with pytest.raises(KeyError):
+        stage.take()
+    assert len(stage.intake) == 0 and stage.leases.count("w") == len(NAMES)
+
+
+def test_messages_that_nobody_takes_are_no_more_than_so_many(stage):
+    """Others wait in the ring, which is bounded; once some were taken the thread goes on."""
+    for _ in range(batch_intake.WAITING):
+        stage.send()
+    stage.ring.put(stage.message)
+    time.sleep(0.05)
+    assert stage.intake.done == batch_intake.WAITING and stage.ring.waiting.qsize() == 1
+    assert stage.take() == set(NAMES)
+    end = time.monotonic() + 60
+    while not stage.intake.done:
+        assert time.monotonic() < end
+        time.sleep(1e-3)
+    assert stage.take() == set() and stage.ring.waiting.empty()
 
 
 def test_what_waits_for_the_thread_is_taken_before_a_worker_is_forgotten(stage):

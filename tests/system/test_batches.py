@@ -19,7 +19,7 @@ from protocol.messages_pb2 import FactorBatch, MatrixBatch
 from protocol.shared_memory.limits import obstacle
 from protocol.shared_memory.view import SlotMap
 from protocol.validate import checksum
-from sim_server.network import batch_decoder, batch_intake, job_sender, worker_choice
+from sim_server.network import batch_decoder, batch_intake, batch_sender, sending, worker_choice
 from sim_server.network.batch_message import MOST_TOGETHER
 from sim_server.network.job_sender import JobSender
 from sim_server.network.link import ServerLink
@@ -193,6 +193,30 @@ def test_jobs_by_columns_travel_as_a_list_of_them(stage: Hand, monkeypatch: pyte
     with pytest.raises(ValueError, match="values"):
         dispatch.submit_many(JobsTogether.of([replace(job, values=job.values[1:]) for job in jobs(950)]))
     assert one_by_one == [4, 2, 4, 4] and not dispatch.leases.jobs
+    dispatch.factor_failed("hand", "a")
+    for names, expected in ((("b", "c"), 4), (("a", "b"), 5)):  # only a job of an object that failed is looked at
+        flying = stage.batch(names, form=JobsTogether.of)
+        assert len(one_by_one) == expected
+        stage.send(stage.answer(flying))
+        stage.driver.until(lambda names=names: stage.made() == set(names), "their factors")
+    dispatch.factor_helped("hand", "a")
+
+
+def test_jobs_of_several_messages_are_shared_evenly(stage: Hand, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A small message costs about as much as a large one."""
+    monkeypatch.setattr(batch_sender, "MOST_TOGETHER", 3)
+    stage.driver.factors.clear()
+    stage.driver.until(lambda: stage.driver.link.dispatch.ready() >= 4, "room")
+    stage.step = 970
+    assert stage.driver.link.dispatch.submit_many(JobsTogether.of(jobs(970))) == [True] * 4
+    told = []
+    for _ in range(2):
+        batch = MatrixBatch.FromString(bytes(stage.driver.until(stage.received.try_recv, "a batch").attachment))
+        told.append(list(batch.objects))
+        stage.send(stage.answer(batch))
+    stage.driver.until(lambda: stage.made() == set(NAMES), "their factors")
+    stage.check_factors()
+    assert told == [["a", "b"], ["c", "d"]]
 
 
 def test_jobs_for_which_there_is_no_room_are_not_taken(stage: Hand) -> None:
@@ -435,8 +459,8 @@ def test_what_waits_behind_a_first_job_has_longer(stage: Hand) -> None:
     stage.driver.submit(new, 1)
     batch = stage.batch()
     leases = {job.object: job.deadline - job.sent_at for job in stage.driver.link.dispatch.leases.jobs}
-    assert {name: round(leases[name]) for name in NAMES} == dict.fromkeys(NAMES, round(job_sender.BEHIND))
-    assert leases["new"] > 2 * job_sender.BEHIND, "but not as long: a message may be lost"
+    assert {name: round(leases[name]) for name in NAMES} == dict.fromkeys(NAMES, round(sending.BEHIND))
+    assert leases["new"] > 2 * sending.BEHIND, "but not as long: a message may be lost"
     answer, values = stage.hand.right_answer(stage.hand.receive(), new)
     stage.hand.answer(answer, values)
     stage.send(stage.answer(batch))

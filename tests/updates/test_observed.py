@@ -169,6 +169,15 @@ def test_requests_say_what_the_table_holds(ahead):
     assert table.counts() == (table.copying.sum(), flying.sum(), (table.failures > 0).sum())
 
 
+def test_means_are_of_what_is_known():
+    table = UpdateTable(4)
+    assert table.mean(table.cost) is None
+    table.cost[[0, 2]] = 1.0, 4.0
+    assert table.mean(table.cost) == 2.5
+    table.cost[:] = 3.0
+    assert table.mean(table.cost) == 3.0
+
+
 def test_records_tell_of_bodies_that_ran_away_and_of_factors_that_were_left():
     records = np.zeros(9, RECORD)
     assert told(records[:0]) == told(records) == 0

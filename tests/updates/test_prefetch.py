@@ -36,32 +36,32 @@ def paced(period: float, steps: int = 20) -> PrefetchDepth:
 )
 def test_as_many_as_workers_can_take_within_a_step(period, service, workers, depth):
     prefetch = paced(period)
-    prefetch.update(np.array([service, np.nan, service]), workers)
+    prefetch.update(service, 3, workers)
     assert prefetch.depth == pytest.approx(depth, abs=1)
     assert TRANSFER < 0.002
 
 
 def test_copies_that_take_several_steps_are_begun_ahead():
     """As on a GPU, whose steps go on while a matrix travels to the host."""
-    prefetch, seconds = paced(0.001), np.full(1000, 2e-4)
+    prefetch, told = paced(0.001), (2e-4, 1000)
     prefetch.on_copy(0.01)
-    prefetch.update(seconds, 1, queued=True)
+    prefetch.update(*told, 1, queued=True)
     assert prefetch.depth == pytest.approx(MORE * 50, abs=1), "a few more than it can make until they are there"
     assert prefetch.patience == pytest.approx(MAX_WAIT + 9, abs=1)
-    prefetch.update(seconds, 3, queued=True)
+    prefetch.update(*told, 3, queued=True)
     assert prefetch.depth == 1000 // SHARE, "all of them would be on their way for long"
-    prefetch.update(np.full(8000, 2e-4), 99, queued=True)
+    prefetch.update(2e-4, 8000, 99, queued=True)
     assert prefetch.depth == MAX_DEPTH
-    prefetch.update(seconds, 1)
+    prefetch.update(*told, 1)
     assert prefetch.depth == 0, "jobs that travel one by one keep a worker waiting"
 
 
 def test_nothing_is_known_before_the_first_steps_and_factors():
     prefetch = PrefetchDepth()
-    prefetch.update(np.array([0.001]), 4)
+    prefetch.update(0.001, 1, 4)
     assert prefetch.depth == 0
     prefetch = paced(1.0)
-    prefetch.update(np.array([np.nan, np.nan]), 4)
+    prefetch.update(None, 2, 4)
     assert prefetch.depth == 0
 
 

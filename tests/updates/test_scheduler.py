@@ -249,18 +249,18 @@ def test_an_object_whose_jobs_fail_is_asked_less_and_less_often(failures, waited
 
 
 def test_bounds_of_the_age():
-    assert round_duration([1, 2, 3], 2) == 3
-    assert overdue_after(8, [1, 2, 3], 2) == 24
-    assert max_factor_age(24, [1, 2, 3], 2) == 24 + 3 + 2 * 3 + 2
-    assert overdue_after(8, [1.0], 0) == math.inf  # nobody serves: nobody is overdue before another
-    assert max_factor_age(math.inf, [1.0], 0) == max_factor_age(8, [], 1) == -1
+    assert round_duration(1 + 2 + 3, 2) == 3
+    assert overdue_after(8, 1 + 2 + 3, 2) == 24
+    assert max_factor_age(24, 1 + 2 + 3, 3, 2) == 24 + 3 + 2 * 3 + 2
+    assert overdue_after(8, 1.0, 0) == math.inf  # nobody serves: nobody is overdue before another
+    assert max_factor_age(math.inf, 1.0, 1.0, 0) == max_factor_age(8, 0, 0, 1) == -1
 
 
 def oldest_seen(rule: Rule, services: list[int], wild: dict[int, float], workers: int, rounds: float) -> int:
     """Largest age of a factor in 3000 steps of a server with such objects, whose factors take so many steps each."""
     rows = [request(str(k), waited=0, age=0, factorization_cost=float(s)) for k, s in enumerate(services)]
     done: dict[int, int] = {}  # object: step at which its factor comes
-    seen, overdue = 0, overdue_after(rounds, services, workers)
+    seen, overdue = 0, overdue_after(rounds, sum(services), workers)
     for step in range(3000):
         for k in [k for k, at in done.items() if at <= step]:
             rows[k] = dataclasses.replace(rows[k], in_flight=False, age=rows[k].waited)
@@ -281,7 +281,7 @@ def oldest_seen(rule: Rule, services: list[int], wild: dict[int, float], workers
 def test_nobody_starves(rule, rounds, workers):
     """Three of twelve need all that the workers can do; the others are served within the bound all the same."""
     services = [1, 2, 5, 9] * 3
-    bound = max_factor_age(overdue_after(rounds, services, workers), services, workers)
+    bound = max_factor_age(overdue_after(rounds, sum(services), workers), sum(services), max(services), workers)
     seen = oldest_seen(rule, services, {0: 50.0, 5: 80.0, 6: 100.0}, workers, rounds)
     assert 0 < seen <= bound
 

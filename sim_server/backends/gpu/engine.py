@@ -23,6 +23,7 @@ from sim_server.backends.base import ArrayChange, Capability, EngineInput, Launc
 from sim_server.backends.cpu.structs import REACTION
 from sim_server.backends.factors_together import FactorsTogether
 from sim_server.backends.gpu.central_difference import ESTIMATE_EVERY
+from sim_server.backends.gpu.copy_lists import ListedCopies
 from sim_server.backends.gpu.cuda import CudaDevice
 from sim_server.backends.gpu.cupy_types import Graph
 from sim_server.backends.gpu.device import DeviceLaunch, Gpu
@@ -109,7 +110,7 @@ class GpuEngine(DeviceLoop):
         self._changes, self._work_graphs = ChangeMailbox(self.loop), list[Graph]()
         self._known: Float64 = arrays["values"]  # as a factor is to know them
         writer = StepRecords(gpu, self.solver.results, self._energies.records, CAPACITY, self.loop)
-        self._graphs = StepGraphs(self._steps, self.sequence, writer, self.targets)
+        self._graphs = StepGraphs(self._steps, self.sequence, writer, ListedCopies(gpu), self)
         self._graphs.give_to(self)
         if given.touch is not None:
             self._report_grabs(device, cast(DeviceLaunch, given.touch))

@@ -21,18 +21,24 @@
 static bool deliver(GpuLoop& l, StepBatch& batch, int slots) {
     if (!l.posted.exchange(0, std::memory_order_acquire)) return true;
     bool left = slots < l.mail_slot_count;
-    char* next = batch.upload;
+    static thread_local std::vector<DeviceCopy> copies;
+    copies.clear();
+    int64_t used = sizeof(CopyList);
+    void* over = nullptr;  // the last event that was found to have completed
     for (int k = 0; k < slots; ++k) {
         MailSlot& slot = l.mail_slots[k];
         if (!slot.pending && slot.posted.load(std::memory_order_relaxed)) slot.pending = slot.posted.exchange(nullptr);
         if (!slot.pending) continue;
-        if (slot.pending->event && !done(l, slot.pending->event)) {
-            left = true;
-            continue;
+        if (void* event = slot.pending->event; event && event != over) {  // mail of a batch has one event
+            if (!done(l, event)) {
+                left = true;
+                continue;
+            }
+            over = event;
         }
-        std::memcpy(next, slot.pending->bytes, slot.size);
-        CALL(to_device, slot.target, next, (size_t)slot.size, l.stream);
-        next += (slot.size + 15) / 16 * 16;
+        std::memcpy(batch.mail.list + used, slot.pending->bytes, slot.size);
+        copies.push_back({(char*)slot.target, (const char*)(batch.mail.target + used), slot.size});
+        used += (slot.size + 15) / 16 * 16;
         if (&slot == l.touch) std::memcpy(&l.touched, slot.pending->bytes, sizeof l.touched);  // n, its first member
         int64_t number = slot.pending->number;
         slot.after = l.launched;
@@ -41,7 +47,7 @@ static bool deliver(GpuLoop& l, StepBatch& batch, int slots) {
         slot.taken.store(number, std::memory_order_release);
     }
     if (left) l.posted.store(1, std::memory_order_relaxed);
-    return !l.error;
+    return !l.error && make_copies(l, batch.mail, copies, used);
 }
 
 // Makes the changes of parameters that wait, in the order of the steps; the balance of the last step has been made.
@@ -51,7 +57,7 @@ static bool take_changes(GpuLoop& l) {
     if (!next) return true;
     CALL(graph_launch, next->before, l.stream);
     for (int64_t i = 0; i < next->count; ++i)
-        CALL(on_device, next->copies[i].target, next->copies[i].source, (size_t)next->copies[i].bytes, l.stream);
+        CALL(on_device, (Address)next->copies[i].target, (Address)next->copies[i].source, (size_t)next->copies[i].bytes, l.stream);
     for (int i = 0; next->places && i < l.bodies; ++i) {
         l.readbacks[i].values_begin = next->places[2 * i];
         l.readbacks[i].values_bytes = next->places[2 * i + 1];
@@ -111,9 +117,15 @@ static bool close_batch(GpuLoop& l) {
     return true;
 }
 
+// Whether matrices are asked for or on their way, or mail waits: what follows goes on sooner after shorter batches.
+static bool exchanges(const GpuLoop& l) {
+    return l.matrix_step >= 0 || l.requested.load(std::memory_order_relaxed) || l.posted.load(std::memory_order_relaxed);
+}
+
 // The ring has room for the records of three batches, those under way and one that is read meanwhile: one that finds no room is slow.
 static int64_t batch_size(GpuLoop& l, int64_t left) {
-    int64_t size = l.rings.realtime || l.step_seconds == 0 ? 1 : (int64_t)(l.batch_seconds / l.step_seconds) + 1;
+    const double aim = exchanges(l) ? l.exchange_seconds : l.batch_seconds;
+    int64_t size = l.rings.realtime || l.step_seconds == 0 ? 1 : (int64_t)(aim / l.step_seconds) + 1;
     const int64_t room = l.rings.record_capacity / (3 * l.bodies);
     return std::max<int64_t>(1, std::min({size, left, room, l.batch - l.launched % l.batch}));  // so none goes over the end of the device's rings
 }
@@ -260,7 +272,7 @@ static void report(GpuLoop& l, StepBatch& batch, int64_t k, double end, double c
 static bool finish_batch(GpuLoop& l) {
     StepBatch& batch = l.batches[l.finished % STEP_BATCHES];
     const double lasts = l.step_seconds * batch.steps;
-    if (!await(l, batch.done, l.idle_since + lasts, lasts)) return false;
+    if (!await(l, batch.done, l.idle_since + lasts, lasts, [&l] { return publish_meanwhile(l); })) return false;
     double end = l.idle_since = now(), cpu = thread_time();
     const StepTimestamp &first = l.timestamps[batch.first % l.capacity], &last = l.timestamps[(batch.first + batch.steps - 1) % l.capacity];
     l.step_seconds = 1e-9 * (last.end - first.begin) / batch.steps;
@@ -292,6 +304,15 @@ static bool begin(GpuLoop& l) {
     return true;
 }
 
+// Waits, while matrices and mail come and go, until the batch under way is nearly over: what comes meanwhile goes with the next one.
+// One that ends sooner than the last one did is noticed within `lead`.
+static void await_mail(GpuLoop& l) {
+    if (l.begun == l.finished || !exchanges(l)) return;
+    const StepBatch& under_way = l.batches[l.finished % STEP_BATCHES];
+    const double due = l.idle_since + l.step_seconds * under_way.steps - l.lead;
+    for (double left; (left = due - now()) > 0 && !l.error && !done(l, under_way.done);) nap(std::min({left, l.lead, publish_meanwhile(l)}));
+}
+
 // Batches that may be under way while the next one is launched. One whose records have no place leaves none to those behind it.
 static int64_t most_under_way(const GpuLoop& l) {
     const bool placed = l.begun == l.finished || l.batches[(l.begun - 1) % STEP_BATCHES].place >= 0;
@@ -308,6 +329,7 @@ int64_t wf_gpu_run(GpuLoop* loop, int64_t steps) {
     while (well && left > 0) {
         well = finish_down_to(l, most_under_way(l));
         if (!well || !wait(l)) break;
+        await_mail(l);
         int64_t size = l.rings.pause.load() ? 1 : batch_size(l, left);  // single steps
         well = launch_batch(l, size);
         left -= size;
@@ -354,7 +376,7 @@ void wf_gpu_start_balances(int64_t count, const int64_t* bodies, Balance* balanc
 const StructSize* wf_sizes() {
     static const StructSize sizes[] = {SIZE(CudaDriver), SIZE(Mail), SIZE(MailSlot), SIZE(RecordTarget), SIZE(StepTimestamp),
                                        SIZE(NewtonResult), SIZE(StageResult), SIZE(ContactResult), SIZE(SubstepResult), SIZE(BodyReadback), SIZE(GpuLoop), SIZE(Record),
-                                       SIZE(Balance), SIZE(Reaction), SIZE(PairSum), SIZE(DeviceCopy), SIZE(DeviceChanges), {}};
+                                       SIZE(Balance), SIZE(Reaction), SIZE(PairSum), SIZE(DeviceCopy), SIZE(CopyLaunch), SIZE(DeviceChanges), {}};
     return sizes;
 }
 }

@@ -1,10 +1,13 @@
 // SPDX-License-Identifier: MIT
 // Memory of the GPU loop (loop.cpp), and its calls of the driver. structs.py holds the same layouts.
 #pragma once
+#include <algorithm>
 #include <cstdio>
 #include <cstring>
+#include <vector>
 
 #include "../cpu/native/ring_buffers.h"
+#include "copy_list.cuh"
 #include "step_results.cuh"
 
 typedef uint64_t Address;       // of device memory
@@ -38,13 +41,8 @@ struct MailSlot {               // bytes on the device that are replaced between
     std::atomic<int64_t> taken;  // number of that mail
 };
 
-struct DeviceCopy {             // new contents of an array on the device
-    Address target, source;
-    int64_t bytes;
-};
-
 struct DeviceChanges {          // of parameters: copies that are made between the same two steps
-    const DeviceCopy* copies;
+    const DeviceCopy* copies;    // new contents of arrays on the device
     const int64_t* places;       // (bodies, 2) values_begin and values_bytes of each body from then on; null: as before
     void *before, *after;        // graphs that make work of the elastic energy that they add
     int64_t count;
@@ -62,8 +60,14 @@ struct BodyReadback {                    // copies of a body's matrix or positio
     std::atomic<int64_t> copied_step;    // step of the last copy that has arrived, -1: none
 };
 
+struct CopyLaunch {         // copies that the device makes in one launch
+    char* list;             // page-locked: CopyList, contents of mail, copies (copy_list.cuh)
+    Address target;         // memory of the device, of the same size, from which it reads them: over the bus each warp would wait
+    void* graph;            // of copy_list.cu
+};
+
 struct StepBatch {                     // steps whose results are looked at together
-    char* upload;          // pinned; room for one mail of every slot
+    CopyLaunch mail;       // to the slots' targets; room for one mail of every slot
     void* done;            // event
     void* records;         // graph that settles the energy balance of the last step and writes the records that `target` says
     RecordTarget* target;  // pinned
@@ -113,6 +117,7 @@ struct GpuLoop {
     int64_t capacity, batch;               // batch: most steps in one; divides the capacity
     Address values, staged;                // A of all bodies; memory of the same size for copies of it
     char* host_matrices;                   // pinned, of the same size
+    CopyLaunch matrices;                   // of matrices and positions from where steps have them to `staged`; room for one of each body
     void *staged_event, *copied_event;     // of the matrices under way: copied on the device, copied to the host
     Address x, v, frame_staging;           // frame_staging: memory for FRAME_COPIES frames
     int64_t frame_bytes;                   // of x
@@ -120,6 +125,9 @@ struct GpuLoop {
     int64_t pose_bytes;                    // of all obstacles; 0 without contact
     double* clock;                         // (1,) time of the simulation [s], for readers on the host
     double batch_seconds;                  // largest aim for the duration of a batch [s]
+    double exchange_seconds;               // likewise while matrices are asked for and mail comes
+    double lead;                           // [s] before the end of a batch the next one is launched then
+    double copy_poll;                      // [s] between queries of copies that are nearly there
     double poll;                           // [s] between queries of an event that is nearly due
     double step_seconds;                   // of the last batch, 0: not known
     double idle_since;                     // time at which the device ran dry, or the end of the last batch was seen
@@ -153,14 +161,29 @@ static bool done(GpuLoop& l, void* event) {
     return !failed(l, answer, "event_query");
 }
 
+// Has the device make copies, in the order of the steps. used: bytes of the list before them.
+static bool make_copies(GpuLoop& l, const CopyLaunch& launch, const std::vector<DeviceCopy>& copies, int64_t used = sizeof(CopyList)) {
+    if (copies.empty()) return true;
+    const CopyList begin = {(long long)copies.size(), used};
+    const size_t bytes = copies.size() * sizeof(DeviceCopy);
+    std::memcpy(launch.list, &begin, sizeof begin);
+    std::memcpy(launch.list + used, copies.data(), bytes);
+    CALL(to_device, launch.target, launch.list, (size_t)used + bytes, l.stream);
+    CALL(graph_launch, launch.graph, l.stream);
+    return true;
+}
+
 // Waits for an event without a busy loop: sleeps until about when it is due, then queries it at intervals, which are longer where the
-// work before it lasts longer. due: steady clock [s]. lasts [s]
-static bool await(GpuLoop& l, void* event, double due = 0, double lasts = 0) {
+// work before it lasts longer. due: steady clock [s]. lasts [s]. meanwhile: is called before each nap, and returns the longest one [s].
+template <class Meanwhile>
+static bool await(GpuLoop& l, void* event, double due, double lasts, Meanwhile meanwhile) {
     for (double begin = now(), t = begin; !done(l, event); t = now()) {
         if (l.error) return false;
         double over = t - (due > begin ? due : begin);
         if (over > 1) { CALL(event_wait, event); return true; }
-        nap(over < 0 ? -over : l.poll + lasts / 64 + over / 8);
+        const double pause = over < 0 ? -over : l.poll + lasts / 64 + over / 8;
+        nap(std::min(pause, meanwhile()));
     }
     return !l.error;
 }
+static bool await(GpuLoop& l, void* event) { return await(l, event, 0, 0, [] { return 1.0; }); }

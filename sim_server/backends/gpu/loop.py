@@ -16,7 +16,7 @@ from sim_server.arrays import Float64, Int64
 from sim_server.backends.base import Due
 from sim_server.backends.gpu import structs
 from sim_server.backends.gpu.mailbox import DeviceMailbox, Mailboxes, library
-from sim_server.backends.gpu.structs import FRAME_COPIES, RECORD_TARGET
+from sim_server.backends.gpu.structs import COPY_LIST, DEVICE_COPY, FRAME_COPIES, RECORD_TARGET
 from sim_server.backends.measured import Measured
 from sim_server.backends.ring_buffers import Reports
 from sim_server.errors import DeviceLost
@@ -26,8 +26,11 @@ GRAPH_STEPS = (1, 2, 8)  # of which there are graphs
 CAPACITY = 64  # steps whose results are kept; more than can be under way
 FRAMES = 8  # in the ring
 BATCH_SECONDS = 2e-3  # aim for the duration of a batch [s]; requests wait for two batches at most
+EXCHANGE_SECONDS = 5e-4  # likewise while matrices and factors come and go
 DOUBLED = 512 << 20  # bytes of the matrices of all bodies, up to which each has two places for copies
 POLL = 1e-5  # interval between queries of an event [s]
+LEAD = 3e-4  # before the end of a batch the next one is launched then [s]
+COPY_POLL = 1e-4  # likewise of the one behind copies to the host, while their steps are over
 
 
 def places_of_copies(size: int) -> int:
@@ -92,6 +95,7 @@ class DeviceLoop(Reports):
     addresses: device addresses of values, x and v, and with contact poses (obstacles, 7) of float64
 
     targets: addresses of the RecordTarget (step_results.cuh) of each batch that may be under way
+    copy_launches: lists of copies of each of them, of mail, and the one of matrices (loop.h)
     """
 
     def __init__(
@@ -118,15 +122,14 @@ class DeviceLoop(Reports):
         self._room = [block * count for count in most]  # bytes of the blocks of each body at most
         places = places_of_copies(sum(self._room))
         self._doubled = places == 2
-        staged = np.cumsum([0, *(places * room for room in self._room)])
-        self._staged_begin = [int(begin) for begin in staged]  # of the first one of each
-        self._first_places, self._rooms = staged[:-1].astype(np.int64), np.array(self._room, np.int64)
+        staged = np.cumsum([0, *self._room])  # first places of all, and then the second ones: neighbours adjoin
+        self._first_places, self._second = staged[:-1].astype(np.int64), int(staged[-1])
         for entry, (first, last), own in zip(self._readbacks, ranges, staged, strict=False):
             begin, end = block * int(row_start[first]), block * int(row_start[last])
             entry.values_begin, entry.values_bytes, entry.copied_step = begin, end - begin, -1
             entry.staged_begin = int(own)
             entry.x_begin, entry.x_bytes = (3 * np.dtype(real).itemsize * k for k in (first, last - first))
-        self._real, self._value_bytes = np.dtype(real), int(staged[-1])
+        self._real, self._value_bytes = np.dtype(real), places * self._second
         self._targets: dict[int, Float64] = {}
         self._own_memory: dict[int, Float64] = {}  # by its place
         entries = np.ctypeslib.as_array(self._readbacks)
@@ -139,6 +142,7 @@ class DeviceLoop(Reports):
         for name, where in addresses.items():
             setattr(loop, name, where)
         loop.capacity, loop.batch, loop.batch_seconds, loop.poll = CAPACITY, BATCH, BATCH_SECONDS, POLL
+        loop.exchange_seconds, loop.lead, loop.copy_poll = EXCHANGE_SECONDS, LEAD, COPY_POLL
         loop.sizes[:] = GRAPH_STEPS
         loop.frame_bytes, loop.clock, loop.matrix_step = frame, clock.ctypes.data, -1
         loop.frame_staging = device.memory(FRAME_COPIES * 2 * frame)
@@ -159,18 +163,29 @@ class DeviceLoop(Reports):
         if held_reactions is not None:
             loop.held_reactions, loop.holders = held_reactions.ctypes.data, held_reactions.shape[2]
         self.report_reactions(loop.obstacles + loop.holders, loop.obstacles, poses)
-        self._pinned = self._events_and_memory(loop, sum(-(-size // 16) * 16 for _, size in mailboxes))
+        assert all(size % 4 == 0 for _, size in mailboxes)  # as copy_list.cu copies
+        self._pinned = self._events_and_memory(loop)
+        self._pinned += self._lists_of_copies(loop, sum(-(-size // 16) * 16 for _, size in mailboxes))
 
-    def _events_and_memory(self, loop: structs.GpuLoop, upload: int) -> list[NDArray[np.uint8]]:
-        memory = [self._device.pinned(max(upload, 16)) for _ in loop.batches]
+    def _events_and_memory(self, loop: structs.GpuLoop) -> list[NDArray[np.uint8]]:
         targets = [self._device.pinned(RECORD_TARGET.itemsize) for _ in loop.batches]
         self.targets = [target.ctypes.data for target in targets]
-        for batch, upload_memory, target in zip(loop.batches, memory, self.targets, strict=True):
-            batch.upload, batch.target, batch.done = upload_memory.ctypes.data, target, self._device.event()
+        for batch, target in zip(loop.batches, self.targets, strict=True):
+            batch.target, batch.done = target, self._device.event()
         for copy in loop.frame_copies:
             copy.taken, copy.arrived = self._device.event(), self._device.event()
         loop.staged_event, loop.copied_event = self._device.event(), self._device.event()
-        return memory + targets
+        return targets
+
+    def _lists_of_copies(self, loop: structs.GpuLoop, contents: int) -> list[NDArray[np.uint8]]:
+        """Makes room for the lists. contents: bytes of one mail of every slot"""
+        self.copy_launches = [*(batch.mail for batch in loop.batches), loop.matrices]
+        mail = contents + loop.mail_slot_count * DEVICE_COPY.itemsize
+        sizes = [mail] * len(loop.batches) + [loop.bodies * DEVICE_COPY.itemsize]
+        lists = [self._device.pinned(COPY_LIST.itemsize + size) for size in sizes]
+        for launch, memory in zip(self.copy_launches, lists, strict=True):
+            launch.list, launch.target = memory.ctypes.data, self._device.memory(len(memory))
+        return lists
 
     def report_grabs(self, graph: int, mailbox: int, reactions: NDArray[Any], counts: NDArray[Any]) -> None:
         """Has records come with what bodies exert on grabs.
@@ -206,12 +221,14 @@ class DeviceLoop(Reports):
     # --- running ------------------------------------------------------------------------------------------------
 
     def use_graphs(
-        self, graphs: Sequence[int], records: Sequence[int], energy_balance: int, elastic_energy: int, matrix: int = 0
+        self, graphs: Sequence[int], records: Sequence[int], copies: Sequence[int], energy_balance: int,
+        elastic_energy: int, matrix: int = 0,
     ) -> None:  # fmt: skip
         """Sets the handles of the CUDA graphs.
 
         graphs: of GRAPH_STEPS (0: none), then the same beginning with the kernel that writes the time
         records: for each of `targets`, settles the energy balance of the last step and writes the records asked for
+        copies: for each of `copy_launches`, makes its copies
         energy_balance: settles the energy balance of the last step
         elastic_energy: adds the elastic energy to it
         matrix: makes A of the next step, for a copy; 0: each step makes its own
@@ -219,6 +236,8 @@ class DeviceLoop(Reports):
         self.loop.graphs[0][:], self.loop.graphs[1][:] = graphs[: len(GRAPH_STEPS)], graphs[len(GRAPH_STEPS) :]
         for batch, graph in zip(self.loop.batches, records, strict=True):
             batch.records = graph
+        for launch, graph in zip(self.copy_launches, copies, strict=True):
+            launch.graph = graph
         self.loop.energy_balance, self.loop.elastic_energy = energy_balance, elastic_energy
         self.loop.matrix = matrix
 
@@ -309,13 +328,13 @@ class DeviceLoop(Reports):
 
     def _other_place(self, body: int) -> int:
         """First byte of the place for a copy that the last one was not brought to: who has that may still read it."""
-        begin = self._staged_begin[body]
-        return begin + self._room[body] if self._staged_at[body] == begin else begin
+        begin = int(self._first_places[body])
+        return begin + self._second if self._staged_at[body] == begin else begin
 
     def _other_places(self, bodies: Int64) -> Int64:
         """Returns the same of each of some bodies."""
         begin = self._first_places[bodies]
-        places: Int64 = np.where(self._staged_at[bodies] == begin, begin + self._rooms[bodies], begin)
+        places: Int64 = np.where(self._staged_at[bodies] == begin, begin + self._second, begin)
         return places
 
     def prepare_copies(self) -> None:

@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: MIT
-// Copies of frames and matrices from the device to the host, beside the steps: first a copy within the device in the order of
-// the steps, then one to the host on another stream. They are published once they have arrived.
+// Copies of frames and matrices from the device to the host, beside the steps: first copies within the device in the order of
+// the steps, those of matrices in one launch, then copies to the host on another stream. They are published once they have arrived.
 #pragma once
 #include "loop.h"
 
@@ -10,10 +10,9 @@ static int64_t readback_bytes(const BodyReadback& body) { return body.in_flight 
 // Whether a request is met before a step: a matrix that no step makes by itself is made then. All others are met after a step.
 static bool met_before(const GpuLoop& l, int32_t request) { return l.matrix && request == REQUEST_VALUES; }
 
-// Begins the copies that are met before, or after, the step launched next, or last.
-static bool begin_matrices(GpuLoop& l, bool before) {
-    if (l.matrix_step >= 0 || (before && !l.matrix) || !l.requested.exchange(0, std::memory_order_acquire)) return true;
-    bool any = false, others = false;
+// Lists the requests that are met before, or after, a step as copies within the device, in the order of their targets.
+static void list_copies(GpuLoop& l, bool before, std::vector<DeviceCopy>& copies) {
+    bool others = false;
     for (int i = 0; i < l.bodies; ++i) {
         BodyReadback& body = l.readbacks[i];
         int32_t request = body.requested.load(std::memory_order_acquire);
@@ -23,21 +22,36 @@ static bool begin_matrices(GpuLoop& l, bool before) {
             continue;
         }
         body.in_flight = request;
-        if (before && !any) CALL(graph_launch, l.matrix, l.stream);
-        any = true;
-        Address from = request == REQUEST_VALUES ? l.values + body.values_begin : l.x + body.x_begin;
-        CALL(on_device, l.staged + body.staged_begin, from, (size_t)readback_bytes(body), l.stream);
+        const Address from = request == REQUEST_VALUES ? l.values + body.values_begin : l.x + body.x_begin;
+        copies.push_back({(char*)(l.staged + body.staged_begin), (const char*)from, readback_bytes(body)});
     }
     if (others) l.requested.store(1, std::memory_order_release);
-    if (!any) return true;
+    std::sort(copies.begin(), copies.end(), [](const DeviceCopy& a, const DeviceCopy& b) { return a.target < b.target; });
+}
+
+// Begins to bring to the host what copies have made, those whose places adjoin in one transfer. copies: in the order of their targets
+static bool begin_transfers(GpuLoop& l, const std::vector<DeviceCopy>& copies) {
     CALL(event_record, l.staged_event, l.stream);
     CALL(stream_wait, l.copy_stream, l.staged_event, 0);
-    for (int i = 0; i < l.bodies; ++i) {
-        BodyReadback& body = l.readbacks[i];
-        if (body.in_flight)
-            CALL(to_host, l.host_matrices + body.staged_begin, l.staged + body.staged_begin, (size_t)readback_bytes(body), l.copy_stream);
+    for (size_t k = 0; k < copies.size();) {
+        const Address place = (Address)copies[k].target;
+        int64_t bytes = copies[k].bytes;
+        while (++k < copies.size() && (Address)copies[k].target == place + bytes) bytes += copies[k].bytes;
+        CALL(to_host, l.host_matrices + (place - l.staged), place, (size_t)bytes, l.copy_stream);
     }
     CALL(event_record, l.copied_event, l.copy_stream);
+    return true;
+}
+
+// Begins the copies that are met before, or after, the step launched next, or last.
+static bool begin_matrices(GpuLoop& l, bool before) {
+    if (l.matrix_step >= 0 || (before && !l.matrix) || !l.requested.exchange(0, std::memory_order_acquire)) return true;
+    static thread_local std::vector<DeviceCopy> copies;
+    copies.clear();
+    list_copies(l, before, copies);
+    if (copies.empty()) return true;
+    if (before) CALL(graph_launch, l.matrix, l.stream);
+    if (!make_copies(l, l.matrices, copies) || !begin_transfers(l, copies)) return false;
     l.matrix_step = before ? l.launched.load() : l.launched - 1;  // steps completed before the matrix was assembled; positions are those after that step
     return true;
 }
@@ -57,6 +71,13 @@ static void publish(GpuLoop& l) {
     if (l.matrix_step >= 0 && done(l, l.copied_event)) publish_matrices(l);
     while (l.rings.frame_head.load() < l.frames_begun && done(l, l.frame_copies[l.rings.frame_head.load() % FRAME_COPIES].arrived))
         l.rings.frame_head.fetch_add(1, std::memory_order_release);
+}
+
+// Publishes copies that arrive while something else is awaited; returns how soon to look again [s].
+static double publish_meanwhile(GpuLoop& l) {
+    const auto under_way = [&l] { return l.matrix_step >= 0 && l.rings.step > l.matrix_step; };  // and their step is over
+    if (under_way()) publish(l);
+    return under_way() ? l.copy_poll : 1;
 }
 
 static bool finish_oldest_frame(GpuLoop& l) {

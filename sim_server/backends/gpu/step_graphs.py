@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: MIT
 """CUDA graphs of the steps of a scene, and of what is launched between them."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import partial
 
+from sim_server.backends.gpu.copy_lists import ListedCopies
 from sim_server.backends.gpu.cupy_types import Graph, Stream
 from sim_server.backends.gpu.loop import GRAPH_STEPS, DeviceLoop
 from sim_server.backends.gpu.step_records import StepRecords
@@ -16,26 +17,30 @@ class StepGraphs:
     """Captures the graphs of a scene, and keeps them.
 
     stream: of the steps. sequence: launches of a step
-    writer: writes the records of a batch. targets: addresses of a RecordTarget for each batch that may be under way
+    writer: writes the records of a batch. copies: makes copies. loop: whose lists of both they read
 
     second_half: of a step whose assembly was launched without a graph; None: all that follows may be, too
     """
 
-    def __init__(self, stream: Stream, sequence: StepSequence, writer: StepRecords, targets: Sequence[int]):
+    def __init__(
+        self, stream: Stream, sequence: StepSequence, writer: StepRecords, copies: ListedCopies, loop: DeviceLoop
+    ):  # fmt: skip
         self._stream, self._sequence, self._writer, energies = stream, sequence, writer, sequence.energies
         self._kept: list[Graph] = []
         self._steps = [self._captured_steps(steps, begin) for begin in (False, True) for steps in GRAPH_STEPS]
         others = [energies.launch_balance, energies.launch_elastic]
         others += [sequence.assemble_matrix] if sequence.makes_matrix_apart else []
         self._others = [self.captured(launch) for launch in others]
-        self._records = [self.captured(partial(self._end_batch, target)) for target in targets]
+        self._records = [self.captured(partial(self._end_batch, target)) for target in loop.targets]
+        self._copies = [self.captured(partial(copies.launch, each)) for each in loop.copy_launches]
         self.second_half = self.captured(sequence.finish) if sequence.branches else None
 
     def give_to(self, loop: DeviceLoop) -> None:
         """Has a loop launch them."""
         steps = [handle(graph) if graph else 0 for graph in self._steps]
         records = [handle(graph) for graph in self._records]
-        loop.use_graphs(steps, records, *(handle(graph) for graph in self._others))
+        copies = [handle(graph) for graph in self._copies]
+        loop.use_graphs(steps, records, copies, *(handle(graph) for graph in self._others))
 
     def captured(self, launch: Callable[[], None]) -> Graph:
         """Returns the graph of the work that `launch` appends to the stream; it is kept as long as this object."""

@@ -8,11 +8,13 @@ from sim_server.backends.declarations import Declarations
 LOOP = Declarations("backends/gpu/loop.h")
 RECORDS = Declarations("backends/gpu/step_records.cu")
 BUILD = Declarations("backends/gpu/launch_build.h")
+COPIES = Declarations("backends/gpu/copy_list.cu")
 PCG = Declarations("backends/gpu/pcg_structs.cuh")
 STAGES = Declarations("backends/gpu/stages.cuh")
 CONTACT = Declarations("backends/gpu/contact_state.cuh")
 CORRECTION = Declarations("backends/gpu/correction_state.cuh")
 ENERGY_RECORD, STEP_RECORDS = RECORDS.dtype("EnergyRecord"), RECORDS.dtype("StepRecords")
+COPY_LIST, DEVICE_COPY = COPIES.dtype("CopyList"), COPIES.dtype("DeviceCopy")
 PCG_RESULT = PCG.dtype("PcgResult")
 PAIR_SUM = LOOP.dtype("PairSum")
 NEWTON_RESULT = PCG.dtype("NewtonResult")
@@ -45,7 +47,12 @@ class MailSlot(c.Structure):
 
 @LOOP.struct
 class DeviceCopy(c.Structure):
-    """New contents of an array on the device."""
+    """A copy within the device, or to it."""
+
+
+@LOOP.struct
+class CopyLaunch(c.Structure):
+    """Copies that the device makes in one launch."""
 
 
 @LOOP.struct

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sim_server.arrays import Float64, Int64
+from sim_server.arrays import Int64
 from sim_server.updates.body_state import on_sent
 from sim_server.updates.policies.base import UpdatePolicy
 from sim_server.updates.prefetch import PrefetchDepth
@@ -58,7 +58,8 @@ class Async(UpdatePolicy):
     def _pump(self) -> None:
         driver = self.driver
         if self.prefetch.on_step(driver.engine.step, time.monotonic()) and not driver.counted:
-            self.prefetch.update(driver.table.cost, driver.source.worker_count(), driver.source.queues_jobs())
+            source, table = driver.source, driver.table
+            self.prefetch.update(table.mean(table.cost), len(table), source.worker_count(), source.queues_jobs())
         self._exchange_copies()
         if (begin := time.monotonic()) >= self._choice_due:
             self._choose()  # of a thousand bodies it takes milliseconds: half of the time is kept for all else
@@ -118,10 +119,11 @@ class Async(UpdatePolicy):
 
     def max_age(self) -> int:
         """Returns a bound by the latencies measured so far."""
-        if np.isnan(self.driver.table.latency).all():
+        table = self.driver.table
+        if table.mean(table.latency) is None:
             return -1
         jobs = self._jobs()  # asked once: a worker may join or leave at any time
-        return max_factor_age(self._overdue(jobs), self._latencies(), jobs)
+        return max_factor_age(self._overdue(jobs), self._latencies(), float(np.nanmax(table.latency)), jobs)
 
     def on_job_end(self) -> None:
         """Takes note that there is a body again whose matrix may be requested."""
@@ -189,13 +191,11 @@ class Async(UpdatePolicy):
         solver = self.driver.solver
         return max(overdue_after(solver.schedule_rounds, self._latencies(), jobs), solver.update_floor_steps)
 
-    def _latencies(self) -> Float64:
-        """Returns the steps from matrix to factor of each body; those not known yet are the mean of the others."""
-        values = self.driver.table.latency
-        if not np.isnan(values.sum()):
-            return values
-        unknown = np.isnan(values)
-        return np.where(unknown, 1.0 if unknown.all() else values[~unknown].mean(), values)
+    def _latencies(self) -> float:
+        """Returns the steps from matrix to factor of all bodies together; unknown ones are the mean of others."""
+        table = self.driver.table
+        mean = table.mean(table.latency)
+        return len(table) * (1.0 if mean is None else mean)
 
 
 class Adaptive(Async):
