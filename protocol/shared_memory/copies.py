@@ -6,7 +6,6 @@ takes longer than to copy a small array.
 """
 
 import ctypes as c
-from collections.abc import Sequence
 from functools import cache
 from importlib import import_module
 from pathlib import Path
@@ -16,7 +15,7 @@ import numpy as np
 import xxhash
 from numpy.typing import NDArray
 
-from protocol.shared_memory.located import address, addresses
+from protocol.shared_memory.located import address
 from protocol.validate import ALONE, checksum, copied, helping_threads
 
 SOURCE = Path(__file__).with_name("copies.cpp")
@@ -75,17 +74,19 @@ class Copies:
             arguments: list[Any] = [c.c_int64, p, p, p, i, p, p, i]
             self._library.copy_all.restype, self._library.copy_all.argtypes = None, arguments
 
-    def gather(self, sources: Sequence[NDArray[Any]], target: NDArray[np.uint8]) -> list[int]:
-        """Copies arrays one behind the other to the begin of a target. Returns the `checksum` of each copy. Raises
-        ValueError if there is no room for them."""
-        if not all(each.flags.c_contiguous for each in sources):
-            sources = [np.ascontiguousarray(each) for each in sources]
-        size = np.array([each.nbytes for each in sources], np.int64)
+    def gather(
+        self, sources: NDArray[np.int64], size: NDArray[np.int64], target: NDArray[np.uint8]
+    ) -> list[int]:  # fmt: skip
+        """Copies memory one piece behind the other to the begin of a target. Returns the `checksum` of each copy.
+        Raises ValueError if there is no room for them.
+
+        sources, size: addresses of the pieces, which must be there until this returns, and their bytes (k,)
+        """
         parts = Parts(target, np.cumsum(size) - size)
         if self._library is None:
-            pairs = zip([each.reshape(-1).view(np.uint8) for each in sources], parts.split(size), strict=True)
-            return [copied(source, part, part)[0] for source, part in pairs]
-        return self._call(addresses(sources), parts.addresses(size), size, False)
+            pieces = [_at(*each) for each in zip(sources.tolist(), size.tolist(), strict=True)]
+            return [copied(s, t, t)[0] for s, t in zip(pieces, parts.split(size), strict=True)]
+        return self._call(sources.astype(np.uintp), parts.addresses(size), size, False)
 
     def copy_parts(
         self, source: Parts, target: Parts, size: NDArray[np.int64], own_sources: bool = False
@@ -120,3 +121,8 @@ class Copies:
             hash_address(), sums.ctypes.data, threads,
         )  # fmt: skip
         return list(sums.tolist())
+
+
+def _at(address: int, size: int) -> NDArray[np.uint8]:
+    """Returns the bytes at an address."""
+    return np.ctypeslib.as_array((c.c_uint8 * size).from_address(address))

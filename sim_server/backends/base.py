@@ -361,9 +361,9 @@ class Engine(Protocol):
         `request_matrix` it saves a copy. The matrix behind that one leaves it alone. None: there is none such."""
         ...
 
-    def request_matrices(self, bodies: Int64) -> list[Float64] | None:
-        """Does `request_matrix` for the `copy_memory` of each of some bodies, and returns that memory; None, and does
-        nothing: there is none."""
+    def request_matrices(self, bodies: Int64) -> tuple[list[Float64], Int64] | None:
+        """Does `request_matrix` for the `copy_memory` of each of some bodies, and returns that memory and its
+        addresses; None, and does nothing: there is none."""
         ...
 
     def request_positions(self, body: int, target: Float64, ahead: float = 0.0) -> None:

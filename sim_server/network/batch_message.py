@@ -12,7 +12,7 @@ from protocol.factor import ROOM_ALIGNMENT
 from protocol.messages_pb2 import Header, MatrixBatch
 from protocol.method import COMPLETE, Method
 from protocol.shared_memory.pool import Slot
-from sim_server.arrays import Float64, Int64
+from sim_server.arrays import Int64
 from sim_server.network.factor_decoder import AnnouncedObject
 from sim_server.network.jobs_in_flight import JobsInFlight
 from sim_server.network.native_copies import native_copies
@@ -90,7 +90,8 @@ def batch_message(
     )  # fmt: skip
 
 
-def fill(message: MatrixBatch, matrices: Sequence[Float64], slot: Slot) -> None:
-    """Copies the matrices of a batch into their slot, and the checksums of the copies into its message. From any
-    thread."""
-    message.checksums.extend(native_copies().gather(matrices, slot.array(np.uint8, slot.capacity)))
+def fill(message: MatrixBatch, matrices: Int64, slot: Slot) -> None:
+    """Copies the matrices of a batch into their slot, and the checksums of the copies into its message. matrices:
+    their addresses. From any thread."""
+    size = 72 * np.array(message.blocks, np.int64)
+    message.checksums.extend(native_copies().gather(matrices, size, slot.array(np.uint8, slot.capacity)))

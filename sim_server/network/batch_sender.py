@@ -5,9 +5,6 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
-from operator import attrgetter
-
-import numpy as np
 
 from protocol.channels import key
 from protocol.messages_pb2 import MatrixBatch
@@ -18,8 +15,6 @@ from sim_server.network.jobs_in_flight import JobsInFlight
 from sim_server.network.sending import Sending
 from sim_server.updates.factor_source import Job
 from sim_server.updates.jobs_together import JobsTogether
-
-SHAPE, DTYPE, FLOAT64 = attrgetter("shape"), attrgetter("dtype"), np.dtype(np.float64)  # of matrices
 
 
 @dataclass
@@ -66,13 +61,12 @@ class BatchSender:
             if [each.epoch for each in known] != jobs.epochs:
                 return None
             told = BatchLayout.of(known, method, jobs.dtype)
-        shapes = [(blocks, 3, 3) for blocks in told.blocks]
-        fit = shapes == list(map(SHAPE, jobs.values)) and set(map(DTYPE, jobs.values)) == {FLOAT64}
-        return told if fit and told.rooms.all() else None
+        return told if told.blocks == jobs.blocks and told.rooms.all() else None
 
     def send(self, worker: str, jobs: JobsTogether, told: BatchLayout) -> list[bool]:
         """Sends jobs to a worker in as few messages as they fit into, each of about as many."""
-        messages = -(-len(jobs) // MOST_TOGETHER)
+        if (messages := -(-len(jobs) // MOST_TOGETHER)) == 1:
+            return self._send(worker, jobs, told)
         each = -(-len(jobs) // messages)
         parts = [slice(k, k + each) for k in range(0, len(jobs), each)]
         return [sent for part in parts for sent in self._send(worker, jobs[part], told.part(part))]
@@ -85,7 +79,8 @@ class BatchSender:
             return [self._send_alone(worker, job) for job in jobs]
         seconds, periods = leases.terms.of_all(jobs.objects, told.blocks, worker, jobs.method.name)
         batch = sending.begin(worker, jobs, seconds, periods)
-        batch.first, batch.rooms, batch.matrices, batch.bodies = told.first, told.rooms, jobs.values, jobs.bodies
+        batch.first, batch.rooms, batch.bodies = told.first, told.rooms, jobs.bodies
+        batch.matrices, batch.matrices_at = jobs.values, jobs.at
         batch.slots, batch.factor_slot, batch.factor_generation = slots, slots[1], slots[1].generation
         leases.start(batch)
         message = partial(batch_message, batch, told, seconds.tolist(), jobs.method, sending.incarnation, *slots)
@@ -102,7 +97,7 @@ class BatchSender:
         not lent again meanwhile."""
         slot, name = filling.slots[0], key("matrices", self._sending.server, worker=batch.worker)
         try:
-            fill(made := message(), batch.matrices, slot)
+            fill(made := message(), batch.matrices_at, slot)
             self._sending.put(batch, name, slot.payload, made.SerializeToString(), True)
         finally:
             filling.over = True

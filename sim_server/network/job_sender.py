@@ -70,8 +70,9 @@ class JobSender:
         able = {name for name, room in rooms.items() if room > 1 and self._choice.takes_batches(name)}
         failing = self._book.reliability.failing_objects
         if isinstance(jobs, JobsTogether) and len(rooms) == len(able) == 1 and failing.isdisjoint(jobs.objects):
-            (worker,) = able
-            if (told := self._batches.layout_of(fitting := jobs[: rooms[worker]])) is not None:
+            ((worker, room),) = rooms.items()
+            fitting = jobs if len(jobs) <= room else jobs[:room]
+            if (told := self._batches.layout_of(fitting)) is not None:
                 return self._batches.send(worker, fitting, told) + [False] * (len(jobs) - len(fitting))
         return self.submit_sorted(jobs, rooms, able, bool(failing))
 

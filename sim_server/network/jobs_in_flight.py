@@ -23,7 +23,8 @@ class JobsInFlight:
     sent_at, deadlines: begin and ends of their leases
     exclusive_until: from then on another worker may be asked for an object
     put_at: when the network took them; inf: it has not yet
-    matrices: what was sent of each, which is read until its job is over; none: of a job alone
+    matrices: what was sent of each, which is read until its job is over, and `matrices_at` their addresses; none: of a
+        job alone
     bodies: numbers by which the sender of jobs knows their objects, likewise; None: it has told none
     factor_slot, factor_generation: shared memory that was lent for the factors; None: they travel as bytes
     slots: all that was lent for matrices and factors, of the host or of a device
@@ -48,6 +49,7 @@ class JobsInFlight:
     first: Int64 = field(default_factory=lambda: np.zeros(1, np.int64))
     rooms: Int64 = field(default_factory=lambda: np.zeros(1, np.int64))
     matrices: Sequence[Float64] = ()
+    matrices_at: Int64 = field(default_factory=lambda: np.zeros(0, np.int64))
     bodies: Int64 | None = None
     factor_slot: Slot | None = None
     factor_generation: int = 0

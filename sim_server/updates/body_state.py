@@ -10,6 +10,7 @@ import numpy as np
 
 from protocol.factor import Factor
 from protocol.method import Method
+from protocol.shared_memory.located import address
 from sim_server.arrays import Float64, Int64
 from sim_server.backends.rosenbrock import FORMS
 from sim_server.mechanics.world import Body
@@ -92,6 +93,7 @@ class JobState:
     def set_copy(self, copy: Float64 | None) -> None:
         """Takes note of the memory that the loop is asked to copy into; None: the copy is given up."""
         self._table.copies[self._index], self._table.copying[self._index] = copy, copy is not None
+        self._table.copy_at[self._index] = 0 if copy is None else address(copy)
 
     @property
     def matrix(self) -> tuple[int, Float64] | None:
@@ -307,12 +309,16 @@ class BodyUpdateState:
             self.solves.max_factor_age = max(self.solves.max_factor_age, int(record["step"]) - 1 - factor_step)
 
 
-def on_requests(table: UpdateTable, rows: Int64, copies: Sequence[Float64], first: int, now: float) -> None:
-    """Takes note of the memory that the loop is asked to copy the matrices of different bodies into. first: number of
-    the first request, in their order. now: [s, monotonic]"""
+def on_requests(
+    table: UpdateTable, rows: Int64, copies: Sequence[Float64], at: Int64, first: int, now: float
+) -> None:  # fmt: skip
+    """Takes note of the memory that the loop is asked to copy the matrices of different bodies into.
+
+    at: addresses of the copies. first: number of the first request, in their order. now: [s, monotonic]
+    """
     for row, copy in zip(rows.tolist(), copies, strict=True):
         table.copies[row] = copy
-    table.copying[rows] = True
+    table.copying[rows], table.copy_at[rows] = True, at
     table.request[rows], table.requested[rows] = np.arange(first, first + len(rows)), now
     table.extrapolated[rows] = 0.0
 

@@ -114,6 +114,7 @@ class Driver:
         self._warped = [b.index in simulation.warped for b in world.bodies]
         self._alike = not self.tuned and simulation.splits is None and self.solver.build != "worker"
         """All jobs are of the first epoch, by one method, of matrices."""
+        self._blocks = [simulation.system.most_blocks(b.first, b.last) for b in world.bodies]
 
     # --- steps --------------------------------------------------------------------------------------------------
 
@@ -203,12 +204,12 @@ class Driver:
             ]
             return [job for job in made if job is not None]
         rows = bodies.tolist()
-        names, warps, copies = (
-            [column[row] for row in rows] for column in (self._names, self._warped, self.table.copies)
+        names, warps, blocks, copies = (
+            [column[row] for row in rows] for column in (self._names, self._warped, self._blocks, self.table.copies)
         )
         return JobsTogether(
-            bodies, names, [1] * len(rows), steps.tolist(), warps, cast(list[Float64], copies), self._dtype,
-            self._method, self.engine.staged_matrices(bodies).tolist(),
+            bodies, names, [1] * len(rows), steps.tolist(), warps, cast(list[Float64], copies), blocks,
+            self.table.copy_at[bodies], self._dtype, self._method, self.engine.staged_matrices(bodies).tolist(),
         )  # fmt: skip
 
     def _is_present(self, state: BodyUpdateState, step: int) -> bool:

@@ -58,12 +58,12 @@ class SnapshotPool:
         """Does `request` for some bodies, at once where the loop has memory for their matrices. states: of all"""
         engine, rows = self._simulation.engine, np.asarray(bodies, np.int64)
         whole = self._solver.build != "worker" and self._simulation.splits is None
-        copies = engine.request_matrices(rows) if len(rows) and whole else None
-        if copies is None:
+        memory = engine.request_matrices(rows) if len(rows) and whole else None
+        if memory is None:
             for row in rows.tolist():
                 self.request(states[row])
             return
-        on_requests(self._table, rows, copies, self._requests, time.monotonic())
+        on_requests(self._table, rows, *memory, self._requests, time.monotonic())
         self._requests += len(rows)
 
     def step(self, state: BodyUpdateState) -> int:

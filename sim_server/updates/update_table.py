@@ -117,7 +117,7 @@ class UpdateTable:
     makers: of the last factors
     sent, in_flight, checked, excess_sent, request, requested, extrapolated, positions: as in JobState
     copying: a copy is requested, or waits to be sent
-    copies, matrices: as in JobState, lists; matrix_steps: of these matrices
+    copies, matrices: as in JobState, lists; copy_at: addresses of these copies; matrix_steps: of these matrices
     frozen, error_bound: as in BodyUpdateState
     """
 
@@ -136,6 +136,7 @@ class UpdateTable:
         self.checked, self.matrix_steps, self.request = steps(), steps(), steps()
         self.requested, self.extrapolated, self.positions = zeros(), zeros(), np.zeros(bodies, np.bool_)
         self.copies: list[Float64 | None] = [None] * bodies
+        self.copy_at = np.zeros(bodies, np.int64)
         self.matrices: list[Float64 | None] = [None] * bodies
         self.iteration_cost, self.latency, self.cost = unknown(), unknown(), unknown()
         self.first_excess = unknown()

@@ -760,13 +760,14 @@ def test_matrices_of_several_bodies_are_requested_at_once_as_one_by_one():
     scene = FakeScene(bodies=3)
     scene.loop.run(20)
     first = [scene.loop.copy_memory(k) for k in range(3)]
-    asked = scene.loop.request_matrices(np.array([2, 0]))
+    asked, at = scene.loop.request_matrices(np.array([2, 0]))
     assert asked[0] is first[2] and asked[1] is first[0]
+    assert at.tolist() == [first[k].ctypes.data for k in (2, 0)]
     assert scene.loop.matrix_steps(np.array([0, 1, 2])).tolist() == [-1, -1, -1]
     scene.loop.run(40)
     assert scene.loop.matrix_steps(np.array([0, 1, 2])).tolist() == [20, -1, 20]
     assert (first[0] == 20).all() and (first[2] == 20).all() and not first[1].any()
-    again = scene.loop.request_matrices(np.array([0, 1]))
+    again, _ = scene.loop.request_matrices(np.array([0, 1]))
     assert again[0] is not first[0] and again[1] is first[1]
     scene.loop.run(40)
     assert scene.loop.matrix_steps(np.array([0, 1, 2])).tolist() == [60, 60, 20]
@@ -824,11 +825,11 @@ def test_matrices_that_are_asked_together_are_copied_in_one_launch_and_come_in_o
     scene, size = FakeScene(bodies=6), 2 * 72
     scene.loop.run(20)
     graphs, found = launched(scene), transfers(scene)
-    first = scene.loop.request_matrices(np.array([4, 2, 3]))
+    first, _ = scene.loop.request_matrices(np.array([4, 2, 3]))
     scene.loop.run(20)
     assert graphs.count(COPY_GRAPHS[2]) == 1 and found == [(6 * size + 2 * size, 3 * size)]
     found.clear()
-    second = scene.loop.request_matrices(np.array([0, 1, 2, 3, 5]))
+    second, _ = scene.loop.request_matrices(np.array([0, 1, 2, 3, 5]))
     scene.loop.run(20)
     assert found == [(2 * size, 2 * size), (6 * size, 2 * size), (11 * size, size)]
     assert graphs.count(COPY_GRAPHS[2]) == 2

@@ -66,6 +66,8 @@ def test_jobs_by_columns_are_those_of_each(driver):
     driver.engine.run(1)
     together = driver.make_jobs(*driver.snapshots.completed())
     assert isinstance(together, JobsTogether)
+    assert together.at.tolist() == [values.ctypes.data for values in together.values]
+    assert [72 * blocks for blocks in together.blocks] == [values.nbytes for values in together.values]
     for k, job in enumerate(together):
         alone = driver.make_job(driver.bodies[k], 0)
         assert alone is not None and alone.values is job.values

@@ -300,18 +300,19 @@ class DeviceLoop(Reports):
         one behind it leaves alone; None: where matrices are large, or of another type."""
         return self._memory_at(body, self._other_place(body)) if self._has_copy_memory else None
 
-    def request_matrices(self, bodies: Int64) -> list[Float64] | None:
+    def request_matrices(self, bodies: Int64) -> tuple[list[Float64], Int64] | None:
         """Requests the matrices of some bodies, each as `request_matrix` does for its `copy_memory`, and returns that
-        memory; None, and requests none: where there is no such memory."""
+        memory and its addresses; None, and requests none: where there is no such memory."""
         if not self._has_copy_memory:
             return None
-        self._staging()
+        begin = address(self._staging())
         places = self._other_places(bodies)
         self._staged_at[bodies] = places
         self._copied_steps[bodies] = -1
         self._requests[bodies] = structs.REQUEST_VALUES  # last, as in `_request`
         self.loop.requested = 1
-        return [self._memory_at(body, place) for body, place in zip(bodies.tolist(), places.tolist(), strict=True)]
+        each = zip(bodies.tolist(), places.tolist(), strict=True)
+        return [self._memory_at(body, place) for body, place in each], begin + places
 
     @property
     def _has_copy_memory(self) -> bool:

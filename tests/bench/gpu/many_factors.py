@@ -60,12 +60,12 @@ def measure(
 def watched(
     pump: Callable[[], NDArray[Any]], adopted: Callable[[], int], beams: int, first: float, seconds: float
 ) -> Row:
-    """Measures for `seconds`, from when all beams use their second factor: some of the first ones are old, as they
-    waited for the others. Begins `first` seconds at most after a first factor came, for which a worker on a GPU may
-    compile its kernels, as the server does those that build inverses. pump: what the thread beside the loop does in
-    each round; returns records. adopted: returns how many factors the loop was given."""
+    """Measures for `seconds`, once each beam has got two factors more since all had one: those before are old, as they
+    waited for others, for kernels and for memory. Begins `first` seconds at most after a first factor came, for which
+    a worker on a GPU may compile its kernels, as the server does those that build inverses. pump: what the thread
+    beside the loop does in each round; returns records. adopted: returns how many factors the loop was given."""
     begun, came, cpu = time.monotonic(), float("nan"), 0.0
-    used, uses = np.full(beams, -1), np.zeros(beams, int)  # step of the factor in use, and how many were
+    used, uses = np.full(beams, -1), np.zeros(beams, int)  # step of the factor in use, and how many were since `ready`
     ready = float("nan")
     while uses.min() < 2 and time.monotonic() < (came + first if came == came else begun + PATIENCE):
         r = pump()
@@ -76,8 +76,8 @@ def watched(
             uses[body] += step > used[body]
             used[body] = max(used[body], step)
         if uses.min() and ready != ready:
-            ready = time.monotonic() - came
-    without = int((uses == 0).sum())
+            ready, uses[:] = time.monotonic() - came, 0
+    without = int((used < 0).sum())
     end, records, count, threads = time.monotonic() + seconds, [], adopted(), thread_seconds()
     while time.monotonic() < end:
         busy = time.thread_time()
