@@ -29,8 +29,8 @@ class Answers:
         """Time [s] from matrix to factor, without that for which the job waited behind others of its worker. now: when
         the factor came [s, monotonic]"""
         last = self._book.answered_at.get(job.worker, 0.0)
-        self._book.answered_at[job.worker] = now
-        return now - max(job.sent_at, last)
+        self._book.answered_at[job.worker] = max(last, now)
+        return max(0.0, now - max(job.sent_at, last))
 
     def guarded(self, jobs: Sequence[InFlightJob], take: Callable[[], None]) -> None:
         """Takes in the answers to some jobs. Whatever error that ends with, the jobs are over and the run goes on."""

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""Takes in the factors of messages of several, in a thread of its own: it receives a message, copies its factors out of
-shared memory, checks them and has them made ready for use. The thread that sends jobs sees a message once, at the end.
+"""Takes in the factors of messages of several, in threads of its own: each receives a message, copies its factors out
+of shared memory, checks them and has them made ready for use. The thread that sends jobs sees a message once, at its
+end.
 
 What is known of jobs is only read here, and may change meanwhile; whether the answers still count is decided in `take`.
 """
@@ -8,6 +9,7 @@ What is known of jobs is only read here, and may change meanwhile; whether the a
 import threading
 from collections import deque
 from collections.abc import Callable, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, field
 from functools import partial
 
@@ -50,7 +52,7 @@ class BatchIntake:
     """Factors of messages.
 
     together: that passed all checks, until they are told
-    wake: called in the thread when a message is done
+    wake: called in a thread when a message is done
     begin_check: as of FactorSource.check_with
     """
 
@@ -60,9 +62,9 @@ class BatchIntake:
         self.wake: Callable[[], None] = lambda: None
         self.begin_check: BeginCheck = lambda *jobs: None
         self._beside: set[int] = set()  # numbers of jobs whose factors are taken in
-        self._under_way: Arrived | None = None  # in the thread
+        self._under_way: dict[int, Arrived] = {}  # by thread
         self._done: deque[Arrived | Refused] = deque()  # oldest first
-        self._working = threading.Lock()  # held while a message is taken in
+        self._working: list[threading.Lock] = []  # of each thread, held while it takes a message in
         self._room = threading.Semaphore(WAITING)  # for messages that are done
         self._ring = session.declare_subscriber(key("factors", server), RingChannel(WAITING))
 
@@ -75,20 +77,22 @@ class BatchIntake:
 
     def done_by(self, worker: str) -> int:
         """Number of jobs that a worker has done, whose factors are copied and checked now, or were and are to be taken.
-        Those of messages that wait for the thread are left out: no more are to wait for it."""
-        arrived = {id(each): each for each in (self._under_way, *self._done) if isinstance(each, Arrived)}
+        Those of messages that wait for a thread are left out: no more are to wait for it."""
+        arrived = {id(each): each for each in (*self._under_way.values(), *self._done) if isinstance(each, Arrived)}
         return sum(len(each.jobs) for each in arrived.values() if each.message.worker == worker)
 
-    # ---- in the thread of messages -------------------------------------------------------------------------
+    # ---- in the threads of messages ------------------------------------------------------------------------
 
     def run(self) -> None:
-        """Takes messages in until the session is closed."""
+        """Takes messages in until the session is closed. In as many threads as there are to be."""
+        working = threading.Lock()
+        self._working.append(working)
         while self._room.acquire():
             try:
                 sample = self._ring.recv()
             except zenoh.ZError:  # the session was closed
                 return
-            with self._working:
+            with working:
                 self._take_in(sample)
             self.wake()
 
@@ -100,7 +104,7 @@ class BatchIntake:
             self._done.append(refusal)
         except Exception as error:
             self._done.append(self._counters.unexpected(error, f"a message {str(sample.key_expr)[:200]!r}"))
-        self._under_way = None
+        self._under_way.pop(threading.get_ident(), None)
 
     def _arrived(self, sample: zenoh.Sample) -> Arrived:
         """Returns a message with the factors that answer jobs which are waited for."""
@@ -109,7 +113,7 @@ class BatchIntake:
         self._match(arrived)
         if arrived.jobs:
             self._beside.update(job.number for job in arrived.jobs)
-            self._under_way = arrived
+            self._under_way[threading.get_ident()] = arrived
             arrived.decoded = self._decode(message, arrived.jobs, arrived.told, self.begin_check)
         return arrived
 
@@ -148,8 +152,10 @@ class BatchIntake:
         return len(self._done)
 
     def finish(self) -> None:
-        """Takes all messages that have come, also those that wait for the thread, before a worker is forgotten."""
-        with self._working:
+        """Takes all messages that have come, also those that wait for a thread, before a worker is forgotten."""
+        with ExitStack() as held:
+            for working in list(self._working):
+                held.enter_context(working)
             while (sample := self._ring.try_recv()) is not None:
                 self._room.acquire(blocking=False)
                 self._take_in(sample)
@@ -237,7 +243,7 @@ class BatchIntake:
             for own, factors in taken:
                 book.leases.finish_all(own, factors.seconds)
         for own, factors in taken:
-            self._answers.count(own[0], sum(values.nbytes for values in factors.values), by_slot, len(own))
+            self._answers.count(own[0], len(own) * factors.values[0].nbytes, by_slot, len(own))  # of one pattern
         for k, refusal in decoded.refused:
             if self._is_current(jobs[k]):
                 self._answers.refuse(jobs[k], refusal, by_slot)

@@ -50,6 +50,7 @@ from sim_server.network.send_queue import SendQueue
 log = logging.getLogger(__name__)
 
 SWITCH_SECONDS = 5e-4  # for which a thread may keep Python's lock while the thread that serves the loop wants it back
+MESSAGE_THREADS = 2  # that take in messages of factors: one calls native code while the other has Python's lock
 TOKENS = 4096  # liveliness tokens of clients that may wait to be read
 REPLIES = 1024  # replies to commands that may wait to be sent
 
@@ -119,7 +120,8 @@ class ServerLink:
         self.dispatch = Dispatch(
             session, self.name, self.incarnation, self._pool, self._job_queue, self.counters, silence, clock
         )
-        self._session.thread("factors of messages", self.dispatch.take_in_batches)
+        for k in range(MESSAGE_THREADS):
+            self._session.thread(f"factors of messages {k + 1}", self.dispatch.take_in_batches)
         self._queryables = Queryables(
             self._session, self.name, self.incarnation, self.counters, probe_slot, self._reply_queue, self._claim,
             self._rights,

@@ -18,9 +18,10 @@ from typing import Any
 
 import numpy as np
 
-from sim_server.backends.gpu import device
+from sim_server.backends.gpu import device, structs
 from sim_server.backends.gpu import engine as gpu_engine
 from sim_server.backends.gpu.conditions import Loop
+from sim_server.backends.gpu.inverse import build_inverse
 from sim_server.backends.gpu.inverse.workspace import workspace
 from tests.backends.fake_cuda import FakeDevice
 from tests.backends.fake_graphs import Graphs, Work
@@ -83,9 +84,27 @@ class Stream:
         return Graph(self.graphs.end())
 
     def record(self) -> Any:
-        return SimpleNamespace(ptr=5, synchronize=lambda: None)
+        return Event()
 
     def wait_event(self, event: Any) -> None: ...
+
+
+class Event:
+    """One that has come."""
+
+    ptr = 6
+
+    def __init__(self, **options: Any): ...
+    def record(self, stream: Any = None) -> None: ...
+    def synchronize(self) -> None: ...
+
+
+def no_driver() -> structs.CudaDriver:
+    """Functions that do nothing, in place of the driver's."""
+    return structs.CudaDriver(**{name: c.cast(NOTHING, c.c_void_p) for name, _ in structs.CudaDriver._fields_})
+
+
+NOTHING = c.CFUNCTYPE(c.c_int32)(lambda: 0)
 
 
 class Device(FakeDevice):
@@ -131,6 +150,7 @@ def installed(folder: Path, library: Any, monkeypatch: Any) -> Iterator[ModuleTy
     fake, caches = made(folder, library), (device.cupy, device.processors, workspace)
     monkeypatch.setitem(sys.modules, "cupy", fake)
     monkeypatch.setattr(gpu_engine, "CudaDevice", Device)
+    monkeypatch.setattr(build_inverse, "driver_functions", no_driver)
     for function in caches:
         function.cache_clear()
     yield fake
@@ -223,7 +243,7 @@ def made(folder: Path, library: Any) -> ModuleType:
             memcpyDeviceToHost=2, memcpyDefault=4,
             runtimeGetVersion=lambda: 13000, **memory,
         ),
-        Device=CurrentDevice, Event=lambda **o: SimpleNamespace(ptr=6, record=lambda stream=None: None),
+        Device=CurrentDevice, Event=Event,
         Stream=Stream, get_current_stream=CurrentStream, memory=SimpleNamespace(OutOfMemoryError=MemoryError),
         alloc_pinned_memory=lambda size: np.zeros(max(size, 1), np.uint8),
         compiler=SimpleNamespace(CompileException=CompileException),

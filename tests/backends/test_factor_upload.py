@@ -114,13 +114,11 @@ class Maker:
 
     def use(
         self, bodies: np.ndarray, planned: SimpleNamespace, storages: list[list[int]], planes: int, steps: list[int]
-    ) -> None:
+    ) -> np.ndarray:
         if self.unusable.intersection(bodies.tolist()):
             raise NoMemory("no vectors")
         self.bodies["factor"][bodies] = [storage[0] for storage in storages]
         self.planes_used.append(planes)
-
-    def factor_rows(self, bodies: np.ndarray) -> np.ndarray:
         return self.bodies["factor"][bodies].view(np.uint8).reshape(len(bodies), 8)
 
 
@@ -843,3 +841,61 @@ def test_one_of_many_that_has_no_vectors_is_told_alone(many, caplog):
         "object 'beam1': a factor cannot be used on the GPU: not enough GPU memory: no vectors; "
         "it goes on with block Jacobi"
     ]
+
+
+def test_digits_that_are_known_are_not_found_out_again(many):
+    """Who checks factors finds them out; of those that are not known the others are."""
+    maker, upload, boxes = many
+    asked, choose = list[int](), maker.planes_of
+
+    def planes_of(factors: list[tuple[SimpleNamespace, np.ndarray]]) -> list[int]:
+        asked.extend(int(values[0]) for _, values in factors)
+        return choose(factors)
+
+    maker.planes_of, maker.fine = planes_of, {11}
+    factors = [(body, PATTERN, np.array([10 + body]), 10 + body, planes) for body, planes in enumerate((2, 0, 1, 0))]
+    upload.post_many(factors)
+    maker.thread.submit(lambda: None).result()
+    assert asked == [11, 13] and [box.posted for box in boxes] == [10, 11, 12, 13]
+    assert sorted(maker.planes_used) == [1, 2]
+
+
+def test_those_that_wait_are_begun_by_the_thread_that_ended_others(many, monkeypatch):
+    """Nobody has to look."""
+    maker, upload, boxes = many
+    monkeypatch.setattr(module, "TOGETHER", 1)
+    go = held_builds(maker)
+    post_all(upload, values := list(range(1, len(boxes) + 1)))
+    go.set()
+    for _ in boxes:
+        maker.thread.submit(lambda: None).result()
+    assert [box.posted for box in boxes] == values
+
+
+def test_a_body_whose_inverse_could_not_be_kept_gets_the_next_one(many, monkeypatch):
+    maker, upload, boxes = many
+
+    def fails(kept: set[tuple[int, int]]) -> None:
+        raise RuntimeError("broken")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(maker, "forget_plans", fails)
+        post_all(upload, [1] * len(boxes))
+        maker.thread.submit(lambda: None).result()
+    with pytest.raises(RuntimeError, match="broken"):
+        upload.advance()
+    post_all(upload, values := [9] * len(boxes))
+    maker.thread.submit(lambda: None).result()
+    assert [box.posted for box in boxes] == values
+    upload.settle()
+
+
+def test_who_settles_is_told_what_failed_beside(many, monkeypatch):
+    maker, upload, boxes = many
+    go = held_builds(maker)
+    with monkeypatch.context() as patch:
+        patch.setattr(maker, "forget_plans", lambda kept: 1 / 0)
+        post_all(upload, [1] * len(boxes))
+        go.set()
+        with pytest.raises(ZeroDivisionError):
+            upload.settle()

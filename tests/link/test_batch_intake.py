@@ -73,10 +73,7 @@ class Stage:
         """Sends a message, and waits until the thread has done with it."""
         done = self.intake.done
         self.ring.put(self.message if message is None else message)
-        end = time.monotonic() + 60
-        while self.intake.done == done:
-            assert time.monotonic() < end
-            time.sleep(1e-3)
+        until(lambda: self.intake.done > done)
 
     def take(self) -> set[str]:
         """Takes what the thread has done; returns the objects that have a factor now, which must be theirs."""
@@ -200,10 +197,7 @@ def test_messages_that_nobody_takes_are_no_more_than_so_many(stage):
     time.sleep(0.05)
     assert stage.intake.done == batch_intake.WAITING and stage.ring.waiting.qsize() == 1
     assert stage.take() == set(NAMES)
-    end = time.monotonic() + 60
-    while not stage.intake.done:
-        assert time.monotonic() < end
-        time.sleep(1e-3)
+    until(lambda: stage.intake.done)
     assert stage.take() == set() and stage.ring.waiting.empty()
 
 
@@ -228,6 +222,46 @@ def test_until_a_message_is_taken_its_worker_has_done_its_jobs(stage, monkeypatc
     assert [stage.intake.done_by(name) for name in "wv"] == seen, "who sends jobs has not taken it yet"
     stage.intake.take(1)
     assert stage.intake.done_by("w") == 0
+
+
+def test_a_message_does_not_wait_for_the_one_before_while_there_is_another_thread(stage, monkeypatch):
+    """Jobs are taken then in another order than they were answered in, which makes no time negative."""
+    threading.Thread(target=stage.intake.run, daemon=True).start()
+    go, decode = threading.Event(), batch_intake.decode_several
+
+    def held(*arguments: Any) -> Any:
+        assert arguments[1].jobs[0] != stage.batch.numbers[0] or go.wait(60)
+        return decode(*arguments)
+
+    monkeypatch.setattr(batch_intake, "decode_several", held)
+    first, second = parts(stage.message, [0, 1]), parts(stage.message, [2, 3, 4])
+    stage.ring.put(first)
+    until(lambda: len(stage.intake) == 2)
+    stage.send(second)
+    assert stage.intake.done_by("w") == len(NAMES)
+    assert stage.take() == {"c", "d", "e"} and len(stage.intake) == 2
+    done = threading.Thread(target=stage.intake.finish)
+    done.start()  # waits for the first
+    go.set()
+    done.join(60)
+    assert stage.take() == {"a", "b"} and stage.leases.count("w") == 0 and stage.counters.refusals == {}
+    assert min(stage.book.timing.expected("w", name) for name in NAMES) >= 0
+    stage.ring.waiting.put(CLOSED)
+
+
+def parts(message: FactorBatch, places: list[int]) -> FactorBatch:
+    """The answers at some places."""
+    some = FactorBatch(header=message.header, worker=message.worker, slot=message.slot)
+    for column in ("jobs", "patterns", "nonzeros", "checksums", "seconds"):
+        getattr(some, column).extend(getattr(message, column)[k] for k in places)
+    return some
+
+
+def until(condition: Any) -> None:
+    end = time.monotonic() + 60
+    while not condition():
+        assert time.monotonic() < end
+        time.sleep(1e-3)
 
 
 def test_jobs_of_which_the_matrices_are_known_are_checked(stage):

@@ -4,7 +4,7 @@
 import ctypes as c
 from collections.abc import Sequence
 from contextlib import AbstractContextManager
-from functools import cached_property
+from functools import cache, cached_property
 from typing import Any
 
 import numpy as np
@@ -22,6 +22,29 @@ FUNCTIONS = {
 }  # fmt: skip
 
 
+@cache
+def driver() -> c.CDLL:
+    """Loads the CUDA driver. Raises DeviceError if there is none."""
+    try:
+        return c.CDLL("libcuda.so.1")
+    except OSError as error:
+        raise _too_old(error) from error
+
+
+@cache
+def driver_functions() -> structs.CudaDriver:
+    """Returns the functions of the driver that native code calls. Raises DeviceError if it lacks one."""
+    try:
+        found = {name: getattr(driver(), symbol) for name, symbol in FUNCTIONS.items()}
+    except AttributeError as error:
+        raise _too_old(error) from error
+    return structs.CudaDriver(**{name: c.cast(f, c.c_void_p) for name, f in found.items()})
+
+
+def _too_old(error: Exception) -> DeviceError:
+    return DeviceError(f"--device gpu: the NVIDIA driver is too old or not there: {error}")
+
+
 class CudaDevice:
     """Implements loop.LoopDevice on the current CUDA device.
 
@@ -30,13 +53,7 @@ class CudaDevice:
     """
 
     def __init__(self, cp: Any):
-        self.cp = cp
-        try:
-            self._driver = c.CDLL("libcuda.so.1")
-            found = {name: getattr(self._driver, symbol) for name, symbol in FUNCTIONS.items()}
-        except (OSError, AttributeError) as error:
-            raise DeviceError(f"--device gpu: the NVIDIA driver is too old or not there: {error}") from error
-        self.functions = structs.CudaDriver(**{name: c.cast(f, c.c_void_p) for name, f in found.items()})
+        self.cp, self._driver, self.functions = cp, driver(), driver_functions()
         cp.cuda.runtime.free(0)  # makes CuPy's context current in this thread
         context = c.c_void_p()
         self._driver.cuCtxGetCurrent(c.byref(context))

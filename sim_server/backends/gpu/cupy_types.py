@@ -41,6 +41,10 @@ class Event(Protocol):
 
     ptr: int
 
+    def record(self, stream: "Stream") -> None:
+        """Puts it behind what was appended to a stream."""
+        ...
+
     def synchronize(self) -> None:
         """Waits until the stream has reached it."""
         ...

@@ -200,7 +200,8 @@ class FactorUpload:
     def _settled(self, body: int) -> Future[None] | None:
         """Has the next step use the newest factor of a body; returns a build that must be waited for first."""
         with self._lock:
-            if body in self._queued and body not in self._building:
+            waits = self._queued.get(body)
+            if waits is not None and waits.wanted and body not in self._building:
                 self._built.pop(body, None)
                 self._inverses.take_back(body)
                 self._has_room([body])

@@ -13,6 +13,7 @@
 #include "../cpu/native/pair_wrenches.h"
 #include "../cpu/native/sizes.h"
 #include "../cpu/native/start_of_balance.h"
+#include "launch_build.h"
 #include "readback.h"
 #include "step_form.h"
 
@@ -358,6 +359,8 @@ void wf_gpu_post(GpuLoop* loop, int64_t count, const int64_t* numbers, Mail* mai
         displaced[k] = loop->mail_slots[numbers[k]].posted.exchange(mail ? mail + k : nullptr) != nullptr;
     loop->posted.store(1, std::memory_order_release);
 }
+
+int32_t wf_launch_build(const CudaDriver* driver, const BuildLaunch* launch) { return launch_build(*driver, *launch); }
 
 // Starts the balances of some bodies. starts: first node of each and the end of the last one. mass: of the nodes [kg]. x, v: of type
 // double, or float where `single`. dt [s].

@@ -27,6 +27,7 @@ def library() -> c.CDLL:
             "wf_gpu_run": (c.c_int64, [loop, c.c_int64]), "wf_gpu_wait": (c.c_int32, [loop]),
             "wf_gpu_open": (c.c_int32, [loop]), "wf_gpu_renew": (c.c_int32, [loop]),
             "wf_gpu_close": (c.c_int32, [loop]), "wf_gpu_post": (None, [loop, c.c_int64, p, p, p]),
+            "wf_launch_build": (c.c_int32, [c.POINTER(structs.CudaDriver), c.POINTER(structs.BuildLaunch)]),
             "wf_gpu_post_changes": (p, [loop, p]), "wf_gpu_take_changes": (c.c_int32, [loop]),
             "wf_gpu_start_balances": (None, [c.c_int64, *[p] * 6, c.c_int32, p, c.c_double, c.c_int32]),
         },

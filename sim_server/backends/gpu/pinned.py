@@ -7,8 +7,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from protocol.shared_memory.located import Located, addresses
+from protocol.shared_memory.located import Located
 from sim_server.backends.gpu.device_values import DeviceValues
+from sim_server.backends.gpu.structs import BUILD
+
+WHERE = BUILD.enumeration("ValuesAre")  # values of a build may be
 
 
 class PinnedArray(Located):
@@ -38,16 +41,13 @@ def is_pinned(array: NDArray[Any] | DeviceValues) -> bool:
     return isinstance(array, DeviceValues) or (isinstance(array, PinnedArray) and array.flags.c_contiguous)
 
 
-def all_pinned(arrays: Sequence[NDArray[Any] | DeviceValues], dtype: np.dtype[Any]) -> bool:
-    """True if the device can read each of some arrays by itself, all of one type."""
-    return all(each.dtype == dtype and is_pinned(each) for each in arrays)
-
-
-def runs(arrays: Sequence[NDArray[Any] | DeviceValues]) -> list[tuple[int, int, int]]:
-    """Returns the copies that put arrays one behind the other, one for arrays that lie so already: first byte of the
-    target, address of the source, bytes."""
-    places, sizes = addresses(arrays).astype(np.int64), np.array([each.nbytes for each in arrays], np.int64)
-    begins = np.cumsum(sizes) - sizes
-    first = np.flatnonzero(np.append(True, places[1:] != places[:-1] + sizes[:-1]))
-    lengths = np.add.reduceat(sizes, first)
-    return list(zip(begins[first].tolist(), places[first].tolist(), lengths.tolist(), strict=True))
+def readable(
+    arrays: Sequence[NDArray[Any] | DeviceValues], dtype: np.dtype[Any]
+) -> tuple[Sequence[NDArray[Any] | DeviceValues], int]:
+    """Returns arrays of a type as they are if the device can read all of them by itself, else in usual memory; and
+    where they are (ValuesAre of launch_build.h)."""
+    if all(each.dtype == dtype and is_pinned(each) for each in arrays):
+        on_device = sum(isinstance(each, DeviceValues) for each in arrays)
+        if on_device in (0, len(arrays)):
+            return arrays, WHERE["ON_DEVICE"] if on_device else WHERE["PAGE_LOCKED"]
+    return [np.ascontiguousarray(np.asarray(each), dtype) for each in arrays], WHERE["PAGEABLE"]

@@ -33,8 +33,27 @@ T = TypeVar("T")
 PCG_BODY = PCG.dtype("PcgBody")
 SETTINGS_BYTES = PCG_BODY.fields["factor_step"][1]  # type: ignore[index]
 """Bytes of a PCG_BODY before the factor: the settings."""
+
+
+def _factor_part() -> np.dtype[Any]:
+    """Returns the fields of a PCG_BODY that are the factor: what is behind its settings."""
+    fields: Any = PCG_BODY.fields
+    names = [name for name in PCG_BODY.names or () if fields[name][1] >= SETTINGS_BYTES]
+    offsets = [fields[name][1] - SETTINGS_BYTES for name in names]
+    size = PCG_BODY.itemsize - SETTINGS_BYTES
+    told: Any = {"names": names, "formats": [PCG_BODY[name] for name in names], "offsets": offsets, "itemsize": size}
+    made: np.dtype[Any] = np.dtype(told)
+    return made
+
+
+FACTOR = _factor_part()
 PLAIN = SolverFeatures()
 PCG_ARGUMENTS, TRIAL_CLOCK = PCG.dtype("PcgArguments"), PCG.dtype("TrialClock")
+
+
+def _bytes_of(rows: NDArray[np.void]) -> NDArray[np.uint8]:
+    """Returns the bytes of some rows, (rows, bytes)."""
+    return rows.view(np.uint8).reshape(len(rows), rows.itemsize)
 
 
 class PlannedInverse(NamedTuple):
@@ -82,6 +101,8 @@ class PcgSolver:
             features = replace(features, smoothing=None)  # smoothed.cu has no pool
         self.features = features
         self.bodies = np.zeros(len(ranges), PCG_BODY)
+        row, part = PCG_BODY.itemsize, np.dtype((np.void, FACTOR.itemsize))  # NumPy copies fields one by one
+        self._factor_part = np.ndarray(len(ranges), part, self.bodies.data, SETTINGS_BYTES, (row,))
         self.bodies["first"], self.bodies["nodes"] = layout.spans[:, 0], layout.nodes
         self.bodies["blocks"], self.bodies["first_range"] = layout.assigned.blocks, layout.partition.first
         self._work = self._memory(len(arrays["row_start"]) - 1)
@@ -347,23 +368,27 @@ class PcgSolver:
     def use(
         self, bodies: Int64, planned: PlannedInverse, storages: Sequence[InverseStorage], planes: int,
         steps: Sequence[int],
-    ) -> None:  # fmt: skip
-        """Writes factors whose inverses have one plan into the host rows of bodies; each is in use once its row is
-        uploaded. steps: of their matrices"""
-        rows, each, in_row = self.bodies, bodies.tolist(), self._plan_in_row
-        for body in [body for body in each if in_row.get(body) is not planned.plan]:
+    ) -> NDArray[np.uint8]:  # fmt: skip
+        """Writes factors whose inverses have one plan into the host rows of bodies, and returns them (`factor_rows`);
+        each is in use once its row is uploaded. steps: of their matrices"""
+        in_row = self._plan_in_row
+        for body in [body for body in bodies.tolist() if in_row.get(body) is not planned.plan]:
             self._use_plan(body, planned.plan, planes)
-        targets = np.array([storage.target for storage in storages], np.uint64)
-        rows["matrix"][bodies], rows["scale"][bodies] = targets[:, 0], targets[:, 1]
-        rows["factor_step"][bodies], rows["helper"][bodies] = steps, 0
+        rows = self._factor_part[bodies]
+        factors, targets = rows.view(FACTOR), np.array([storage.target for storage in storages], np.uint64)
+        factors["matrix"], factors["scale"] = targets[:, 0], targets[:, 1]
+        factors["factor_step"], factors["helper"] = steps, 0
+        self._factor_part[bodies] = rows
         if self._helper:
-            for body, storage in zip(each, storages, strict=True):
+            for body, storage in zip(bodies.tolist(), storages, strict=True):
                 if storage.far:
                     self._use_far(body, planned, storage.far)
+            return self.factor_rows(bodies)
+        return _bytes_of(rows)
 
     def factor_rows(self, bodies: Int64) -> NDArray[np.uint8]:
-        """Returns the bytes of the host rows of bodies that tell their factors, (bodies, bytes)."""
-        return self.bodies[bodies].view(np.uint8).reshape(len(bodies), -1)[:, SETTINGS_BYTES:]
+        """Returns what the host rows of bodies tell of their factors, (bodies, bytes)."""
+        return _bytes_of(self._factor_part[bodies])
 
     def _use_plan(self, body: int, device_plan: DevicePlan, planes: int) -> None:
         """Has a body use factors of another plan."""

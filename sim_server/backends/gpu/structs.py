@@ -7,6 +7,7 @@ from sim_server.backends.declarations import Declarations
 
 LOOP = Declarations("backends/gpu/loop.h")
 RECORDS = Declarations("backends/gpu/step_records.cu")
+BUILD = Declarations("backends/gpu/launch_build.h")
 COPIES = Declarations("backends/gpu/copy_list.cu")
 PCG = Declarations("backends/gpu/pcg_structs.cuh")
 STAGES = Declarations("backends/gpu/stages.cuh")
@@ -57,6 +58,11 @@ class CopyLaunch(c.Structure):
 @LOOP.struct
 class DeviceChanges(c.Structure):
     """New contents of arrays, copied between the same two steps."""
+
+
+@BUILD.struct
+class BuildLaunch(c.Structure):
+    """A build of inverses that is launched."""
 
 
 @LOOP.struct

@@ -6,13 +6,16 @@ build_inverse.cu. Memory is allocated only when an InverseBuilder or an InverseS
 """
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from protocol.factor import FactorPattern
+from protocol.shared_memory.located import addresses
 from sim_server.arrays import Float64
+from sim_server.backends.gpu import structs
+from sim_server.backends.gpu.cuda import driver_functions
 from sim_server.backends.gpu.cupy_types import DeviceArray, Event, Graph, KernelFunction
 from sim_server.backends.gpu.device import Gpu, no_memory_left
 from sim_server.backends.gpu.device_values import DeviceValues
@@ -32,7 +35,8 @@ from sim_server.backends.gpu.inverse.expansion_batches import (
 from sim_server.backends.gpu.inverse.partition import COLUMNS, ROWS
 from sim_server.backends.gpu.inverse.plan import Plan
 from sim_server.backends.gpu.inverse.workspace import workspace
-from sim_server.backends.gpu.pinned import all_pinned, runs
+from sim_server.backends.gpu.mailbox import library
+from sim_server.backends.gpu.pinned import readable
 
 FLOAT32 = np.dtype(np.float32)
 ALIGNMENT = 64  # numbers; 256 bytes, as of what is allocated alone
@@ -179,32 +183,31 @@ class InverseBuilder:
         self, values: Sequence[NDArray[np.floating] | DeviceValues], storages: Sequence[InverseStorage],
         multiprocessors: int | None,
     ) -> Event:  # fmt: skip
-        space, cp, count = self._workspace, self._gpu.cp, len(values)
+        space, cp, count, helped = self._workspace, self._gpu.cp, len(values), self._helper is not None
         assert 0 < count <= self.most and count == len(storages)
-        if space.copied is not None:
-            space.copied.synchronize()
-        head = space.staging[:HEAD].view(BUILDS)[0]
+        head = np.zeros((), BUILDS)
         head["count"] = count
-        targets = [storage.target for storage in storages]
-        head["targets"][:count] = np.array(targets, np.uint64).view(INVERSE_STORAGE).ravel()
-        size = HEAD + 4 * count * self._nonzeros
+        targets = np.array([storage.target for storage in storages], np.uint64)
+        head["targets"][:count] = targets.view(INVERSE_STORAGE).ravel()
         graph, stream = self._graph(multiprocessors, next(c for c in COUNTS if c >= count)), space.stream
-        at, copy, kind = int(space.incoming.data.ptr), cp.cuda.runtime.memcpyAsync, cp.cuda.runtime.memcpyHostToDevice
-        if all_pinned(values, FLOAT32):
-            copy(at, space.staging.ctypes.data, HEAD, kind, stream.ptr)
-            for begin, source, length in runs(values):
-                copy(at + HEAD + begin, source, length, cp.cuda.runtime.memcpyDefault, stream.ptr)
-        else:
-            for row, factor in zip(space.staging[HEAD:size].view(np.float32).reshape(count, -1), values, strict=True):
-                np.copyto(row, np.asarray(factor), casting="same_kind")
-            copy(at, space.staging.ctypes.data, size, kind, stream.ptr)
-        space.copied, space.source = stream.record(), list(values)
-        graph.launch(stream)
+        values, values_are = readable(values, FLOAT32)
+        sources, done = addresses(values), cp.cuda.Event(disable_timing=True)
+        launch = structs.BuildLaunch(
+            stream=stream.ptr, copied=space.copied.ptr, done=0 if helped else done.ptr, graph=int(graph.graphExec),
+            head=head.ctypes.data, head_bytes=HEAD, staging=space.staging.ctypes.data,
+            incoming=int(space.incoming.data.ptr), sources=sources.ctypes.data, count=count,
+            bytes=4 * self._nonzeros, values_are=values_are,
+        )  # fmt: skip
+        error = library().wf_launch_build(driver_functions(), launch)
+        space.source = list(values)
+        if error:
+            raise cp.cuda.runtime.CUDARuntimeError(error)
         if self._helper:
             for each in storages:
                 if each.far:
                     self._helper.copy(each.far, each.matrix, each.scale, stream)
-        return stream.record()
+            done.record(stream)
+        return cast(Event, done)
 
     def _graph(self, limit: int | None, count: int) -> Graph:
         """Returns the graph of a build of up to `count` inverses that keeps at most `limit` multiprocessors busy."""

@@ -35,7 +35,7 @@ class Workspace:
         self.incoming = self.memory
         self._pinned: Any = None
         self.staging: NDArray[np.uint8] = np.zeros(0, np.uint8)
-        self.copied: Event | None = None
+        self.copied: Event = cp.cuda.Event(block=True, disable_timing=True)
         self.source: list[Any] = []
         self.lock = threading.Lock()
 

@@ -29,8 +29,8 @@ class BodyInverses:
 
     def __init__(self, mailboxes: Mailboxes):
         self._mailboxes, count = mailboxes, len(mailboxes)
-        self._patterns = np.zeros((count, MAX_KINDS), np.uint64)  # of each kind
-        self._planes = np.zeros((count, MAX_KINDS), np.int64)  # 0: the body has no such kind
+        self._patterns = [np.zeros(count, np.uint64) for _ in range(MAX_KINDS)]  # of each kind
+        self._planes = [np.zeros(count, np.int64) for _ in range(MAX_KINDS)]  # 0: the body has no such kind
         self._storages: list[list[InverseStorage | None]] = [[None] * (2 * MAX_KINDS) for _ in range(count)]
         self._used, self._posted = np.full(count, NONE), np.full(count, NONE)  # places; posted: not taken up yet
         self._used_steps, self._posted_steps = np.full(count, NONE), np.full(count, NONE)  # of their matrices
@@ -69,10 +69,12 @@ class BodyInverses:
 
     def _spare_places(self, bodies: Int64, kind: InverseKind) -> Int64:
         """Returns the place of an inverse of this kind that no step reads; -1: the body has no such kind."""
-        pattern, planes = kind
-        alike = (self._patterns[bodies] == np.uint64(pattern)) & (self._planes[bodies] == planes)
-        first = 2 * alike.argmax(axis=1)
-        found: Int64 = np.where(alike.any(axis=1), first + (self._used[bodies] == first), NONE)
+        (pattern, planes), used, found = kind, self._used[bodies], np.full(len(bodies), NONE)
+        for number in range(MAX_KINDS):  # arrays of one dimension: indexing others lets go of Python's lock
+            alike = (self._patterns[number][bodies] == np.uint64(pattern)) & (self._planes[number][bodies] == planes)
+            found = np.where(alike, 2 * number + (used == 2 * number), found)
+            if alike.all():
+                break
         return found
 
     def spare(self, bodies: Int64, kind: InverseKind) -> list[InverseStorage | None]:
@@ -95,16 +97,16 @@ class BodyInverses:
 
     def _make_room(self, bodies: Int64, kind: InverseKind, event: Event) -> bool:
         """Gives bodies another kind, in the place of one that is not in use where there is no room."""
-        there = self._planes[bodies] != 0
+        there = np.stack([planes[bodies] != 0 for planes in self._planes], axis=1)
         in_use = np.arange(MAX_KINDS) == (self._used[bodies] // 2)[:, None]
         chosen = (there.astype(int) + in_use).argmin(axis=1)
         given_up = there[np.arange(len(bodies)), chosen]
         if given_up.any():
             event.synchronize()  # a build before it, of one that was dropped, may write there
-        for body, slot in zip(bodies[given_up].tolist(), chosen[given_up].tolist(), strict=True):
-            self._storages[body][2 * slot : 2 * slot + 2] = [None, None]
-        self._patterns[bodies, chosen], self._planes[bodies, chosen] = kind
-        for body in bodies.tolist():
+        for body, slot, full in zip(bodies.tolist(), chosen.tolist(), given_up.tolist(), strict=True):
+            if full:
+                self._storages[body][2 * slot : 2 * slot + 2] = [None, None]
+            self._patterns[slot][body], self._planes[slot][body] = kind
             self._expected.pop(body, None)
         return bool((there & ~in_use).any())
 
@@ -132,7 +134,10 @@ class BodyInverses:
 
     def kinds(self) -> set[InverseKind]:
         """Returns the kinds that bodies have, or will have as far as it is known."""
-        there = self._planes != 0
-        kinds = np.unique(np.stack([self._patterns[there], self._planes[there].astype(np.uint64)]), axis=1)
-        found = {(int(pattern), int(planes)) for pattern, planes in kinds.T}
+        found = {
+            kind
+            for patterns, planes in zip(self._patterns, self._planes, strict=True)
+            for kind in zip(patterns.tolist(), planes.tolist(), strict=True)
+            if kind[1]
+        }
         return found | {(pattern, planes) for pattern in self._expected.values() for planes in (1, 2)}

@@ -51,12 +51,12 @@ class InversePosts:
         bodies, given, planes = built.bodies, built.given, built.kind[1]
         steps = [each.step for each in given]
         try:
-            self._solver.use(bodies, built.planned, built.storages, planes, steps)
+            rows = self._solver.use(bodies, built.planned, built.storages, planes, steps)
         except Exception as error:
             if len(given) == 1:
                 return self.unusable(int(bodies[0]), error)
             return [each for row in range(len(given)) for each in self.post(built.of([row]))]  # those that can be used
-        self._mailboxes.post(bodies, self._solver.factor_rows(bodies), built.event, built.planned)
+        self._mailboxes.post(bodies, rows, built.event, built.planned)
         self._inverses.post(bodies, built.kind, steps, built.event)
         for body in bodies[self.planes[bodies] != planes].tolist():
             self.planes[body] = planes
