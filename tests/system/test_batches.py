@@ -28,7 +28,7 @@ from sim_server.network.worker_timing import WorkerTiming
 from sim_server.updates.factor_check import FactorCheck
 from sim_server.updates.factor_source import Job
 from sim_server.updates.jobs_together import JobsTogether
-from sim_server.updates.take_in import SentMatrices
+from sim_server.updates.take_in import BegunCheck
 from tests.ports import free_endpoint
 
 pytestmark = [
@@ -399,11 +399,11 @@ def test_large_batches_are_checked_where_they_are_decoded(
     )
     residuals: dict[str, float] = {}
 
-    def begin(objects: Any, epochs: Any, patterns: Any, matrices: Any) -> SentMatrices | None:
+    def begin(objects: Any, epochs: Any, patterns: Any) -> BegunCheck | None:
         assert set(epochs) == {1}
         bodies = check.bodies(objects, epochs, patterns)
         assert bodies is not None
-        return SentMatrices(bodies, matrices, 0, end) if known else None
+        return BegunCheck(bodies, 0, end) if known else None
 
     def end(factors: Any, taken: Any) -> None:
         assert threading.current_thread() is not threading.main_thread()
