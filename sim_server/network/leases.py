@@ -54,6 +54,7 @@ class Leases:
         worker, deadlines = batch.worker, batch.deadlines
         self.by_object.update(zip(batch.objects, batch.jobs, strict=True))
         self.by_worker.setdefault(worker, {}).update(zip(batch.numbers, batch.jobs, strict=True))
+        batch.jobs = []
         self._next_deadline = min(self._next_deadline, float(deadlines.min()))
         self._next_exclusive = min(self._next_exclusive, float(batch.exclusive_until.min()))
         if self._deadlines is not None:

@@ -6,6 +6,7 @@ import queue
 import threading
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -142,7 +143,7 @@ def test_each_answer_counts_once(stage):
 def test_what_is_no_answer_to_this_batch_costs_the_others_nothing(stage):
     """A failure, a job that does not exist, and one of another batch, which is in another slot."""
     other = batch_in_flight(range(50, 51), ["b"], 1, 5, "float32", "w", 9.0)
-    stage.leases.finish(stage.batch.jobs[1])
+    stage.leases.finish(stage.leases.by_object["b"])
     stage.leases.start(other)
     stage.message.jobs[1], stage.message.jobs[4] = 50, 1 << 40
     stage.message.failures.extend(["", "", "not positive definite", "", ""])
@@ -167,7 +168,7 @@ def test_an_error_that_no_check_foresees_costs_its_message_alone(stage, monkeypa
         stage.send()
     assert stage.take() == set() and stage.failed() == set(NAMES) and stage.leases.count("w") == 0
     assert stage.counters.refusals == {"unexpected": len(NAMES)} and len(stage.intake) == 0
-    stage.leases.start(stage.batch)
+    stage.leases.start(replace(stage.batch))
     stage.send()
     assert stage.take() == set(NAMES)
 
