@@ -17,7 +17,7 @@ from sim_server.arrays import Int64
 from sim_server.backends.factors_together import FactorsTogether
 from sim_server.network.factor_decoder import LARGE, AnnouncedObject, FactorDecoder, check_slot
 from sim_server.network.jobs_in_flight import InFlightJob, JobsInFlight
-from sim_server.updates.take_in import BeginCheck, SentMatrices, TakenIn, take_in
+from sim_server.updates.take_in import BeginCheck, BegunCheck, TakenIn, take_in
 
 
 class DecodedFactors(NamedTuple):
@@ -75,13 +75,18 @@ class Expected(NamedTuple):
         columns: Any = ([column[row] for row in rows] for column in self[1:])
         return Expected(self.batch, *columns)
 
-    def begin(self, begin_check: BeginCheck) -> SentMatrices | None:
+    def begin(self, begin_check: BeginCheck) -> BegunCheck | None:
         """Returns what the factors are checked with; None: they are checked later."""
-        batch = self.batch
-        if not len(batch.matrices) or batch.positions:
+        if self.matrices is None:
             return None
-        objects, epochs, matrices = self.of_batch(batch.objects, batch.epochs, batch.matrices)
-        return begin_check(objects, epochs, self.patterns, matrices)
+        objects, epochs = self.of_batch(self.batch.objects, self.batch.epochs)
+        return begin_check(objects, epochs, self.patterns)
+
+    @property
+    def matrices(self) -> Int64 | None:
+        """Addresses of the matrices that were sent; None: they are not known."""
+        at = self.batch.matrices_at
+        return None if len(at) == 0 or self.batch.positions else at[self.places]
 
     def of_batch(self, *columns: Sequence[Any]) -> list[list[Any]]:
         """Returns their entries of columns of the batch, which nobody changes."""
@@ -113,8 +118,8 @@ def decode_several(
     found, refused = _expected(decoder, columns, jobs, told)
     if not found.answers:
         return DecodedFactors([], refused)
-    sent = None if begin_check is None else found.begin(begin_check)
-    taken = _taken(decoder, found, sent)
+    check = None if begin_check is None else found.begin(begin_check)
+    taken = _taken(decoder, found, check)
     wrong, method = _wrong(columns, found, taken), found.batch.method
     rows: dict[int, list[int]] = {}  # of good ones by pattern
     for row, pattern in enumerate(found.patterns):
@@ -123,7 +128,7 @@ def decode_several(
     good = []
     for own in rows.values():
         some = found.of(own)
-        good.append(_together(columns, some, taken.of(own), sent))
+        good.append(_together(columns, some, taken.of(own), check))
         decoder.note_sizes(good[-1][1].objects, some.known, some.patterns[0], method)
     return DecodedFactors(good, [*refused, *((found.answers[row], why) for row, why in wrong.items())])
 
@@ -170,7 +175,7 @@ def _why(
     return Refused(f"FactorBatch.jobs has {job.number}, whose object or slot changed meanwhile", "epoch")
 
 
-def _taken(decoder: FactorDecoder, found: Expected, sent: SentMatrices | None) -> TakenIn:
+def _taken(decoder: FactorDecoder, found: Expected, check: BegunCheck | None) -> TakenIn:
     """Copies values of factors out of the slot that was lent for their jobs."""
     slot, dtype = found.batch.factor_slot, np.dtype(found.batch.dtype)
     assert slot is not None
@@ -181,7 +186,7 @@ def _taken(decoder: FactorDecoder, found: Expected, sent: SentMatrices | None) -
     else:
         memory = np.empty(total, dtype)
     source = Parts(slot.part(0, np.uint8, slot.capacity), found.batch.first[found.places])
-    return take_in(source, found.patterns, memory[:total], sent)
+    return take_in(source, found.patterns, memory[:total], check, found.matrices)
 
 
 def _wrong(columns: AnswerColumns, found: Expected, taken: TakenIn) -> dict[int, Refused]:
@@ -199,7 +204,7 @@ def _wrong(columns: AnswerColumns, found: Expected, taken: TakenIn) -> dict[int,
 
 
 def _together(
-    columns: AnswerColumns, found: Expected, taken: TakenIn, sent: SentMatrices | None
+    columns: AnswerColumns, found: Expected, taken: TakenIn, check: BegunCheck | None
 ) -> tuple[list[int], FactorsTogether]:  # fmt: skip
     """Returns factors of one pattern, and their places among the answers."""
     batch, told = found.batch, found.told
@@ -208,6 +213,6 @@ def _together(
         found.patterns[0], batch.worker, batch.method, objects, epochs, steps, warps, taken.values,
         [columns.seconds[k] for k in told], [columns.remedies[k][:200] for k in told], bodies=found.bodies,
     )  # fmt: skip
-    if sent is not None:
-        sent.end(factors, taken)
+    if check is not None:
+        check.end(factors, taken)
     return found.answers, factors

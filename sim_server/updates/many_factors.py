@@ -13,10 +13,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from protocol.factor import FactorPattern
-from sim_server.arrays import Float64, Int64
+from sim_server.arrays import Int64
 from sim_server.backends.factors_together import FactorsTogether
 from sim_server.updates.body_state import MadeFactors, on_checks, on_factors
-from sim_server.updates.take_in import SentMatrices, TakenIn
+from sim_server.updates.take_in import BegunCheck, TakenIn
 from sim_server.updates.update_table import NONE
 
 if TYPE_CHECKING:
@@ -32,17 +32,13 @@ class ManyFactors:
         self._driver = driver
 
     def begin_check(
-        self, objects: Sequence[str], epochs: Sequence[int], patterns: Sequence[FactorPattern],
-        matrices: Sequence[Float64],
-    ) -> SentMatrices | None:  # fmt: skip
+        self, objects: Sequence[str], epochs: Sequence[int], patterns: Sequence[FactorPattern]
+    ) -> BegunCheck | None:  # fmt: skip
         """Returns what factors that arrive are checked with; None: that must wait until they are adopted. From any
         thread; of a job that is over meanwhile another matrix may be written to the memory of its own, and what is
         found counts for nothing (`adopt`)."""
-        driver = self._driver
-        bodies = driver.check.bodies(objects, epochs, patterns)
-        if bodies is None:
-            return None
-        return SentMatrices(bodies, matrices, driver.engine.response_function(), self._note)
+        bodies = self._driver.check.bodies(objects, epochs, patterns)
+        return None if bodies is None else BegunCheck(bodies, self._driver.engine.response_function(), self._note)
 
     def _note(self, factors: FactorsTogether, taken: TakenIn) -> None:
         """Takes note of what was found about factors that arrived, and has those that are good made ready for use."""

@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 
 from protocol.factor import FactorPattern
 from protocol.shared_memory.copies import Parts, hash_address
-from protocol.shared_memory.located import address, addresses, rows
+from protocol.shared_memory.located import address, rows
 from protocol.validate import checksum
-from sim_server.arrays import Float64
+from sim_server.arrays import Int64
 from sim_server.backends.cpu.factors import NativePattern
 from sim_server.backends.factors_together import FactorsTogether
 from sim_server.updates.checked_body import ARRIVING, WORK, CheckedBodies, library, sharing_threads
@@ -24,30 +24,29 @@ from sim_server.updates.checked_body import ARRIVING, WORK, CheckedBodies, libra
 SHARED = 1 << 19  # bytes from where on threads share the work: a millisecond, of which they take a tenth to start
 
 
-class SentMatrices(NamedTuple):
+class BegunCheck(NamedTuple):
     """What factors that arrive are checked with.
 
-    bodies, matrices: of each factor; values (blocks, 3, 3) of the matrix that was sent
+    bodies: of each factor
     responses: address of the function that finds the largest response (inverse/digits.py); 0: nobody asks for it
     end: takes note of what was found about some of them: (factors, their rows)
     """
 
     bodies: CheckedBodies
-    matrices: Sequence[Float64]
     responses: int
     end: Callable[[FactorsTogether, "TakenIn"], None]
 
 
-BeginCheck = Callable[[Sequence[str], Sequence[int], Sequence[FactorPattern], Sequence[Float64]], SentMatrices | None]
-"""Returns what factors are checked with: of objects and their epochs, each with its pattern and the matrix that was
-sent; None: they are checked later. From any thread."""
+BeginCheck = Callable[[Sequence[str], Sequence[int], Sequence[FactorPattern]], BegunCheck | None]
+"""Returns what factors are checked with beside the matrices that were sent: of objects and their epochs, each with its
+pattern; None: they are checked later. From any thread."""
 
 
 class TakenIn(NamedTuple):
     """Factors that were copied.
 
     values: (nonzeros,) of each
-    found: of each, as struct ArrivingFactor, what was found; checks and the response only with SentMatrices
+    found: of each, as struct ArrivingFactor, what was found; checks and the response only with a check
     """
 
     values: list[NDArray[Any]]
@@ -61,12 +60,14 @@ class TakenIn(NamedTuple):
 
 
 def take_in(
-    source: Parts, patterns: Sequence[FactorPattern], memory: NDArray[Any], sent: SentMatrices | None
+    source: Parts, patterns: Sequence[FactorPattern], memory: NDArray[Any], check: BegunCheck | None = None,
+    matrices: Int64 | None = None,
 ) -> TakenIn:  # fmt: skip
     """Copies factors out of parts of an array, one behind the other, into memory (n,) of their type. Raises ValueError
     if a part lies outside of its array, or the memory is of another size. From any thread.
 
     source: may be written to meanwhile; what is returned is about the copies
+    matrices: for a check, addresses of the values (blocks, 3, 3) that each was made from
     """
     kinds = dict.fromkeys(patterns)
     nonzeros = np.full(len(patterns), patterns[0].nonzeros, np.int64)
@@ -80,13 +81,13 @@ def take_in(
     each["source"] = source.addresses(nonzeros * item)
     each["target"] = address(memory) + (ends - nonzeros) * item
     room, responses, natives = 0, 0, dict[FactorPattern, NativePattern]()
-    if sent is None:
+    if check is None:
         natives = {pattern: NativePattern(pattern) for pattern in kinds}
         each["pattern"] = [c.addressof(natives[pattern].native) for pattern in patterns]
     else:
-        each["row_start"], each["columns"], each["r"], each["pattern"], each["nodes"] = sent.bodies.columns.T
-        each["matrix"] = addresses(sent.matrices)
-        room, responses = WORK * 3 * int(each["nodes"].max()), sent.responses
+        each["row_start"], each["columns"], each["r"], each["pattern"], each["nodes"] = check.bodies.columns.T
+        each["matrix"] = matrices
+        room, responses = WORK * 3 * int(each["nodes"].max()), check.responses
     threads = sharing_threads(len(patterns)) if memory.nbytes > SHARED else 1
     work, hashing = np.empty(threads * room), hash_address()
     library().wf_take_in(address(each), len(each), hashing, responses or None, address(work), room, threads)

@@ -16,7 +16,7 @@ import zenoh
 from protocol.channels import key
 from protocol.counters import Counters
 from protocol.messages_pb2 import FactorBatch
-from sim_server.network import batch_intake
+from sim_server.network import batch_decoder, batch_intake
 from sim_server.network.answers import Answers
 from sim_server.network.batch_intake import BatchIntake
 from sim_server.network.bookkeeping import Bookkeeping
@@ -24,7 +24,7 @@ from sim_server.network.leases import Leases
 from sim_server.network.worker_registry import WorkerRegistry
 from sim_server.network.worker_reliability import WorkerReliability
 from sim_server.network.worker_timing import WorkerTiming
-from tests.support.answered_batch import GRAPHS, KINDS, MADE, answered
+from tests.support.answered_batch import KINDS, MADE, answered
 from tests.support.in_flight import batch_in_flight
 
 CLOSED = object()
@@ -264,25 +264,36 @@ def until(condition: Any) -> None:
         time.sleep(1e-3)
 
 
-def test_jobs_of_which_the_matrices_are_known_are_checked(stage):
-    """With the matrix of each, whatever the order of the answers."""
-    matrices = [np.full((2, 3, 3), float(k)) for k in range(len(NAMES))]
-    stage.batch.matrices, stage.batch.bodies = matrices, 10 + np.arange(len(NAMES))
+@pytest.mark.parametrize("positions", [False, True])
+def test_jobs_of_which_the_matrices_are_known_are_checked(stage, monkeypatch, positions):
+    """With the matrix of each, whatever the order of the answers; not by positions."""
+    count = len(NAMES)
+    stage.batch.matrices_at, stage.batch.bodies = 1000 + np.arange(count), 10 + np.arange(count)
+    stage.batch.positions = positions
     asked: list[Any] = []
+    given: list[Any] = []
     stage.intake.begin_check = lambda *jobs: asked.append(jobs)
+    real = batch_decoder.take_in
+
+    def watched(source: Any, patterns: Any, memory: Any, check: Any, matrices: Any) -> Any:
+        given.append(matrices)
+        return real(source, patterns, memory)
+
+    monkeypatch.setattr(batch_decoder, "take_in", watched)
     order = [3, 0, 4, 1, 2]
     for column in ("jobs", "patterns", "nonzeros", "checksums", "seconds"):
         values = list(getattr(stage.message, column))
         del getattr(stage.message, column)[:]
         getattr(stage.message, column).extend(values[k] for k in order)
     stage.send()
-    ((objects, epochs, patterns, given),) = asked
-    assert objects == [NAMES[k] for k in order] and epochs == [1] * len(order)
-    assert [pattern.id for pattern in patterns] == [MADE[KINDS[name]].pattern.id for name in objects]
-    assert all(own is matrices[k] for own, k in zip(given, order, strict=True))
+    if positions:
+        assert asked == [] and given == [None]
+    else:
+        ((objects, epochs, patterns),) = asked
+        assert objects == [NAMES[k] for k in order] and epochs == [1] * count
+        assert [pattern.id for pattern in patterns] == [MADE[KINDS[name]].pattern.id for name in objects]
+        assert given[0].tolist() == [1000 + k for k in order]
     stage.intake.take(1)
-    bodies = {
-        name: int(body) for each in stage.intake.together for name, body in zip(each.objects, each.bodies, strict=True)
-    }
-    assert bodies == {name: 10 + k for k, name in enumerate(NAMES)}
-    assert len(GRAPHS) == 2 and stage.take() == set(NAMES)
+    together = stage.intake.together
+    bodies = {name: int(body) for each in together for name, body in zip(each.objects, each.bodies, strict=True)}
+    assert bodies == {name: 10 + k for k, name in enumerate(NAMES)} and stage.take() == set(NAMES)

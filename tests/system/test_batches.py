@@ -28,7 +28,7 @@ from sim_server.network.worker_timing import WorkerTiming
 from sim_server.updates.factor_check import FactorCheck
 from sim_server.updates.factor_source import Job
 from sim_server.updates.jobs_together import JobsTogether
-from sim_server.updates.take_in import SentMatrices
+from sim_server.updates.take_in import BegunCheck
 from tests.ports import free_endpoint
 
 pytestmark = [
@@ -399,11 +399,11 @@ def test_large_batches_are_checked_where_they_are_decoded(
     )
     residuals: dict[str, float] = {}
 
-    def begin(objects: Any, epochs: Any, patterns: Any, matrices: Any) -> SentMatrices | None:
+    def begin(objects: Any, epochs: Any, patterns: Any) -> BegunCheck | None:
         assert set(epochs) == {1}
         bodies = check.bodies(objects, epochs, patterns)
         assert bodies is not None
-        return SentMatrices(bodies, matrices, 0, end) if known else None
+        return BegunCheck(bodies, 0, end) if known else None
 
     def end(factors: Any, taken: Any) -> None:
         assert threading.current_thread() is not threading.main_thread()
@@ -493,7 +493,7 @@ def test_slots_are_not_lent_again_before_they_are_sent(stage: Hand, monkeypatch:
     stage.driver.until(lambda: dispatch.ready() >= len(NAMES) and not stage.driver.link.slots_lent, "room")
     monkeypatch.setattr(SendQueue, "post", lambda queue, send, name=None: held.append(send) or True)
     assert dispatch.submit_many(jobs(950)) == [True] * len(NAMES)
-    dispatch.leases.cancel(dispatch.leases.jobs)
+    dispatch.leases.cancel(dispatch.leases.jobs[0].batch)
     stage.driver.turn()
     assert len(held) == 1 and stage.driver.link.slots_lent == 2
     held[0]()

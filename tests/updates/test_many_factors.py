@@ -12,13 +12,14 @@ import pytest
 from protocol.factor import Factor
 from protocol.method import Method
 from protocol.shared_memory.copies import Parts
+from protocol.shared_memory.located import addresses
 from sim_server.backends.factors_together import FactorsTogether
 from sim_server.simulation import Simulation
 from sim_server.updates.driver import Driver
 from sim_server.updates.factor_check import FactorCheck
 from sim_server.updates.factor_source import FactorSource, Job
 from sim_server.updates.many_factors import MANY
-from sim_server.updates.take_in import SentMatrices, take_in
+from sim_server.updates.take_in import BegunCheck, take_in
 from sim_server.updates.update_table import NONE
 from tests.scenes import bar, simulation
 
@@ -111,20 +112,20 @@ def checked(driver: Driver) -> None:
         driver.receive(driver.source, driver.policy.on_factors)
 
 
-def begun(driver: Driver, factors: FactorsTogether) -> SentMatrices | None:
+def begun(driver: Driver, factors: FactorsTogether) -> BegunCheck | None:
     """What they would be checked with as they come."""
-    matrices = [driver.by_name[name].job.matrix[1] for name in factors.objects]
-    return driver.source.begin_check(factors.objects, factors.epochs, [factors.pattern] * len(factors), matrices)
+    return driver.source.begin_check(factors.objects, factors.epochs, [factors.pattern] * len(factors))
 
 
 def checked_as_they_come(driver: Driver, factors: FactorsTogether) -> FactorsTogether:
     """As the thread that copies them does."""
-    sent = begun(driver, factors)
+    check = begun(driver, factors)
+    matrices = [driver.by_name[name].job.matrix[1] for name in factors.objects]
     slot, size = np.concatenate(factors.values), factors.values[0].nbytes
-    begin = size * np.arange(len(factors))
-    taken = take_in(Parts(slot, begin), [factors.pattern] * len(factors), np.empty_like(slot), sent)
+    source = Parts(slot, size * np.arange(len(factors)))
+    taken = take_in(source, [factors.pattern] * len(factors), np.empty_like(slot), check, addresses(matrices))
     came = replace(factors, values=taken.values)
-    sent.end(came, taken)
+    check.end(came, taken)
     return came
 
 

@@ -10,6 +10,7 @@ import pytest
 from precond_worker.factorization.factorize import Analysis
 from protocol.factor import Factor, FactorPattern
 from protocol.shared_memory.copies import Parts
+from protocol.shared_memory.located import addresses
 from protocol.validate import checksum
 from sim_server.backends.gpu.inverse.digits import largest_responses, response_function
 from sim_server.updates import checked_body, take_in
@@ -45,8 +46,9 @@ def stage(request: Any) -> SimpleNamespace:
     return made
 
 
-def taken(stage: SimpleNamespace, sent: Any = None) -> Any:
-    return take_in.take_in(Parts(stage.slot, stage.begin), patterns(), stage.memory, sent)
+def taken(stage: SimpleNamespace, check: Any = None) -> Any:
+    source = Parts(stage.slot, stage.begin)
+    return take_in.take_in(source, patterns(), stage.memory, check, addresses(stage.matrices))
 
 
 def value(stage: SimpleNamespace, place: int, entry: int) -> np.ndarray:
@@ -96,8 +98,7 @@ def test_what_is_found_is_the_same_as_if_each_came_alone(stage, helping, monkeyp
     monkeypatch.setattr(take_in, "SHARED", 0)
     check = FactorCheck({name: GRAPHS[kind] for name, kind in zip(names(), KINDS, strict=True)})
     bodies = check.bodies(names(), [1] * len(KINDS), patterns())
-    sent = take_in.SentMatrices(bodies, stage.matrices, response_function(), lambda *_: None)
-    found = taken(stage, sent).found
+    found = taken(stage, take_in.BegunCheck(bodies, response_function(), lambda *_: None)).found
     factors = [
         Factor(name, 1, 5, True, own, values, "w", 0.1)
         for name, own, values in zip(names(), patterns(), stage.values, strict=True)
@@ -115,7 +116,7 @@ def test_what_is_found_is_the_same_as_if_each_came_alone(stage, helping, monkeyp
 def test_memory_of_another_size_and_parts_outside_of_their_array_are_mistakes_of_the_caller(stage):
     for memory in (stage.memory[1:], np.zeros(len(stage.memory), np.float16), np.zeros(2 * len(stage.memory))[::2]):
         with pytest.raises(ValueError, match="numbers of"):
-            take_in.take_in(Parts(stage.slot, stage.begin), patterns(), memory, None)
+            take_in.take_in(Parts(stage.slot, stage.begin), patterns(), memory)
     for begin in (-1, stage.slot.nbytes - 8, 1 << 62):
         stage.begin[3] = begin
         with pytest.raises(ValueError, match="outside"):
