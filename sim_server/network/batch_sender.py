@@ -88,7 +88,7 @@ class BatchSender:
             self._filling.append(filling)
             sending.on_sent(batch, 72 * sum(told.blocks))
             return [True] * len(jobs)
-        leases.cancel(batch.jobs)
+        leases.cancel(batch)
         self._give_back(slots)
         return [False] * len(jobs)
 

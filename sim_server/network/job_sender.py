@@ -148,7 +148,7 @@ class JobSender:
         ):
             self._sending.on_sent(batch, job.values.nbytes)
             return True
-        self._book.leases.cancel(batch.jobs)
+        self._book.leases.cancel(batch)
         return False
 
     def _lend_on_device(self, worker: str, job: Job) -> list[DeviceSlot] | None:
@@ -170,7 +170,7 @@ class JobSender:
         if self._sending.queue.post(partial(self._put_on_device, batch, job, message, matrix)):
             self._sending.on_sent(batch, job.values.nbytes)
             return True
-        leases.cancel(batch.jobs)
+        leases.cancel(batch)
         return False
 
     def _put_on_device(self, batch: JobsInFlight, job: Job, message: Matrix, matrix: DeviceSlot) -> None:

@@ -4,7 +4,6 @@
 Pure bookkeeping, without network or clock.
 """
 
-from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from operator import attrgetter
 from typing import Protocol
@@ -16,7 +15,7 @@ from sim_server.network.jobs_in_flight import InFlightJob, JobsInFlight
 from sim_server.network.lease_terms import DELIVERY, LeaseTerms
 
 MAX_EXPIRED = 2  # expired jobs with which a worker still gets slots of shared memory
-BATCH, NUMBER = attrgetter("batch"), attrgetter("number")  # of jobs
+BATCH = attrgetter("batch")  # of jobs
 
 
 class SlotAllocator(Protocol):
@@ -60,20 +59,20 @@ class Leases:
         if self._deadlines is not None:
             self._deadlines[worker] = max(self._deadlines.get(worker, 0.0), float(deadlines.max()))
 
-    def cancel(self, jobs: Sequence[InFlightJob]) -> None:
-        """Removes jobs of one worker that were never sent."""
-        for job in jobs:
-            del self.by_object[job.object]
-        self._drop(jobs)
-        self._free_slots(jobs)
+    def cancel(self, batch: JobsInFlight) -> None:
+        """Removes jobs that were never sent."""
+        for object in batch.objects:
+            del self.by_object[object]
+        self._drop(batch, batch.numbers)
+        self._free_slots(batch, len(batch))
 
-    def _drop(self, dropped: Sequence[InFlightJob]) -> None:
-        """Removes jobs from those of their worker."""
-        worker = dropped[0].worker
+    def _drop(self, batch: JobsInFlight, numbers: Iterable[int]) -> None:
+        """Removes jobs of a batch from those of their worker."""
+        worker, latest = batch.worker, float(batch.deadlines.max())
         jobs = self.by_worker.get(worker, {})
-        for job in dropped:
-            jobs.pop(job.number, None)
-        if self._deadlines is not None and (latest := _latest(dropped)) >= self._deadlines.get(worker, latest):
+        for number in numbers:
+            jobs.pop(number, None)
+        if self._deadlines is not None and latest >= self._deadlines.get(worker, latest):
             self._deadlines = None  # the latest one may be another now
         if not jobs:
             self.by_worker.pop(worker, None)
@@ -146,16 +145,17 @@ class Leases:
         self.terms.on_factors(jobs[0].batch, [job.object for job in jobs], seconds)
 
     def _end(self, jobs: Sequence[InFlightJob]) -> None:
-        """Removes answered jobs of one worker, and frees all of its slots up to the last one."""
+        """Removes answered jobs of one batch, and frees all slots of its worker up to the last one."""
+        batch, numbers, held = jobs[0].batch, [job.number for job in jobs], self.by_object
         for job in jobs:
-            if self.by_object.get(job.object) is job:
-                del self.by_object[job.object]
-        self._drop(jobs)
+            if held.get(job.object) is job:
+                del held[job.object]
+        self._drop(batch, numbers)
         if self._reassigned:
-            self._reassigned.difference_update(map(NUMBER, jobs))
-        self._free_slots(jobs)
-        if (worker := jobs[0].worker) in self._expired:
-            self._free_expired(worker, max(map(NUMBER, jobs)))
+            self._reassigned.difference_update(numbers)
+        self._free_slots(batch, len(jobs))
+        if batch.worker in self._expired:
+            self._free_expired(batch.worker, max(numbers))
 
     def expire(self, now: float, is_answered: Callable[[InFlightJob], bool] = lambda job: False) -> list[InFlightJob]:
         """Ends the leases that are over: objects and workers are free again, the slots are not. Returns the jobs.
@@ -187,7 +187,7 @@ class Leases:
 
     def _expire(self, over: list[InFlightJob]) -> list[InFlightJob]:
         for job in over:
-            self._drop([job])
+            self._drop(job.batch, [job.number])
             self._reassigned.discard(job.number)
             self.terms.on_expired(job)
             self._expired.setdefault(job.worker, []).append(job)
@@ -204,13 +204,13 @@ class Leases:
     def remove_worker(self, worker: str) -> list[InFlightJob]:
         """Frees all slots of a worker that left; returns its jobs that are of the present epoch of their objects."""
         for old in self._expired.pop(worker, []):
-            self._free_slots([old])
+            self._free_slots(old.batch, 1)
         self.terms.forget_worker(worker)
         jobs = list(self.by_worker.pop(worker, {}).values())
         self._deadlines = None
         for job in jobs:
             self._reassigned.discard(job.number)
-            self._free_slots([job])
+            self._free_slots(job.batch, 1)
         lost = [job for job in jobs if self.by_object.get(job.object) is job]
         for job in lost:
             del self.by_object[job.object]
@@ -229,13 +229,13 @@ class Leases:
         expired = self._expired.get(worker, [])
         for old in [old for old in expired if old.number <= number]:
             expired.remove(old)
-            self._free_slots([old])
+            self._free_slots(old.batch, 1)
 
-    def _free_slots(self, jobs: Sequence[InFlightJob]) -> None:
+    def _free_slots(self, batch: JobsInFlight, jobs: int) -> None:
+        """Frees the slots of so many jobs of a batch, which all of its jobs share."""
         if self._allocator is not None:
-            for batch, users in Counter(map(BATCH, jobs)).items():  # whose slots they share
-                for slot in batch.slots:
-                    self._allocator.give_back(slot, users)
+            for slot in batch.slots:
+                self._allocator.give_back(slot, jobs)
 
 
 def _latest(jobs: Iterable[InFlightJob]) -> float:

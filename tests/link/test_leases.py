@@ -231,7 +231,7 @@ def test_an_object_waits_for_a_slow_worker_only_while_there_is_no_other(leases: 
 
 
 def test_a_job_that_was_never_sent_leaves_no_trace(leases: Leases, allocator: Allocator) -> None:
-    leases.cancel([sent(leases)])
+    leases.cancel(sent(leases).batch)
     assert (leases.by_object, leases.by_worker, allocator.back) == ({}, {}, ["slot 1"])
 
 

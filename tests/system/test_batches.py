@@ -493,7 +493,7 @@ def test_slots_are_not_lent_again_before_they_are_sent(stage: Hand, monkeypatch:
     stage.driver.until(lambda: dispatch.ready() >= len(NAMES) and not stage.driver.link.slots_lent, "room")
     monkeypatch.setattr(SendQueue, "post", lambda queue, send, name=None: held.append(send) or True)
     assert dispatch.submit_many(jobs(950)) == [True] * len(NAMES)
-    dispatch.leases.cancel(dispatch.leases.jobs)
+    dispatch.leases.cancel(dispatch.leases.jobs[0].batch)
     stage.driver.turn()
     assert len(held) == 1 and stage.driver.link.slots_lent == 2
     held[0]()
