@@ -21,6 +21,7 @@ from protocol.shared_memory.view import SlotMap
 from protocol.validate import checksum
 from sim_server.network import batch_decoder, batch_intake, batch_sender, sending, worker_choice
 from sim_server.network.batch_message import MOST_TOGETHER
+from sim_server.network.inbox import Inbox
 from sim_server.network.job_sender import JobSender
 from sim_server.network.link import ServerLink
 from sim_server.network.send_queue import SendQueue
@@ -200,6 +201,29 @@ def test_jobs_by_columns_travel_as_a_list_of_them(stage: Hand, monkeypatch: pyte
         stage.send(stage.answer(flying))
         stage.driver.until(lambda names=names: stage.made() == set(names), "their factors")
     dispatch.factor_helped("hand", "a")
+
+
+def test_messages_are_taken_in_once_a_round(stage: Hand, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Rooms are asked for again once something was sent."""
+    dispatch, read, real = stage.driver.link.dispatch, list[int](), Inbox.__iter__
+
+    def looked(inbox: Inbox) -> Any:
+        read.append(1)
+        return real(inbox)
+
+    stage.driver.until(lambda: dispatch.ready() == 64 and not stage.driver.link.slots_lent, "room")
+    stage.driver.factors.clear()
+    monkeypatch.setattr(Inbox, "__iter__", looked)
+    with dispatch.round():
+        assert dispatch.ready() == 64 and dispatch.submit_many(JobsTogether.of(jobs(980))) == [True] * 4
+        assert dispatch.ready() == 60 and not dispatch.poll() and len(dispatch.workers()) == 1 and len(read) == 1
+    assert dispatch.ready() == 60 and len(read) == 2
+    with pytest.raises(ZeroDivisionError), dispatch.round():
+        raise ZeroDivisionError
+    assert dispatch.ready() == 60 and len(read) == 4
+    stage.step, sample = 980, stage.driver.until(stage.received.try_recv, "the batch")
+    stage.send(stage.answer(MatrixBatch.FromString(bytes(sample.attachment))))
+    stage.driver.until(lambda: stage.made() == set(NAMES), "their factors")
 
 
 def test_jobs_of_several_messages_are_shared_evenly(stage: Hand, monkeypatch: pytest.MonkeyPatch) -> None:
