@@ -10,7 +10,8 @@ from sim_server.network.leases import MAX_EXPIRED
 
 SMALL_BLOCKS = 20_000  # of the largest matrix, if several jobs may wait at a worker
 MOST_ALONE = 32  # jobs in flight at a worker while they go alone, each with slots of its own, which are slow to make
-MOST_BATCHES = 2  # full batches in flight at a worker: one is made, the next is made ready, more would only grow old
+LEAST_BATCHES = 2  # full batches in flight at a worker: one is made while the next is made ready
+MOST_BATCHES = 3  # the same of a fast one: another is on its way there or back, more would only grow old
 QUEUE_SECONDS = 0.02  # s of factorizations that wait at a worker at most
 
 
@@ -45,7 +46,7 @@ class WorkerChoice:
         if info is not None and info.shared_memory and seconds is not None and small:
             most = MOST_BATCHES * MOST_TOGETHER if info.batches and self._book.decoder.most_are_sized else MOST_ALONE
             in_time, together = int(QUEUE_SECONDS / max(seconds, 1e-6)), min(info.together, MOST_TOGETHER)
-            in_time = max(in_time, MOST_BATCHES * together if together > 1 else 1)
+            in_time = max(in_time, LEAST_BATCHES * together if together > 1 else 1)
             most = max(1, min(info.most_jobs, most, in_time))
         return most
 

@@ -205,6 +205,16 @@ def test_each_copy_of_a_body_alone_is_timed():
     assert all(0 < seconds < 60 for seconds in timed)
 
 
+def test_a_factor_that_comes_while_copies_are_sent_is_taken_up_in_the_same_round():
+    sim = falling(bar(name="beam", young=1e6, fixed="X < 0.01"), update="async")
+    driver = Driver(sim, ManyAtATime(patterns_of(sim), most=1, latency=1))
+    driver.pump()
+    driver.engine.run(1)
+    assert driver.bodies[0].factors.used == 0
+    driver.pump()
+    assert driver.bodies[0].factors.used == 1
+
+
 def test_counted_runs_do_not_prefetch():
     sim = falling(bar(name="beam", young=1e6, fixed="X < 0.01"), update="async")
     driver = Driver(sim, counted=True)

@@ -439,5 +439,5 @@ class GpuEngine(DeviceLoop):
 
 def _given(bodies: Sequence[int], factors: FactorsTogether) -> Iterator[Given]:
     """Returns factors as their inverses are built."""
-    planes = getattr(factors, "planes", None) or repeat(0)
+    planes = factors.planes or repeat(0)
     return zip(bodies, repeat(factors.pattern), factors.values, factors.steps, planes)

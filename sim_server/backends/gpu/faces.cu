@@ -176,25 +176,27 @@ __device__ void hold_node(const ContactArguments& c, const SurfaceNode& n) {
     put_at(c, n, from, back);
 }
 
+// Calls f with each node of a body that takes part in contact and is the calling thread's. No lambda with `auto`: some versions of NVRTC take one
+// for a function of the host.
+template <class F> __device__ __forceinline__ void each_own_node(const ContactArguments& c, int body, F f) {
+    for (int i = c.faces.node_start[body] + threadIdx.x; i < c.faces.node_start[body + 1]; i += CONTACT_THREADS)
+        if (const SurfaceNode n = SurfaceNode::at(c, i); n.pair >= 0) f(n);
+}
+
 // Sets what y still takes into obstacles back; returns the number of nodes that are moved. Done by a whole thread block, whose threads have
 // nodes of their own.
 __device__ int hold_body(const ContactArguments& c, int body) {
-    const int first = c.faces.node_start[body], last = c.faces.node_start[body + 1];
-    auto each_own = [&](auto f) {
-        for (int i = first + threadIdx.x; i < last; i += CONTACT_THREADS)
-            if (const SurfaceNode n = SurfaceNode::at(c, i); n.pair >= 0) f(n);
-    };
-    each_own([&](const SurfaceNode& n) {
+    each_own_node(c, body, [&](const SurfaceNode& n) {
         for (long long k = 3ll * n.node; k < 3ll * n.node + 3; ++k) c.start[k] = c.y[k];
     });
     for (int round = 0;; ++round) {
-        each_own([&](const SurfaceNode& n) { clip(c, n); });
+        each_own_node(c, body, [&](const SurfaceNode& n) { clip(c, n); });
         __syncthreads();
         if (round == HOLDS || !note_passages(c, body)) break;
-        each_own([&](const SurfaceNode& n) { hold_node(c, n); });
+        each_own_node(c, body, [&](const SurfaceNode& n) { hold_node(c, n); });
     }
     double moved[1] = {0};
-    each_own([&](const SurfaceNode& n) {
+    each_own_node(c, body, [&](const SurfaceNode& n) {
         const real *y = c.y + 3ll * n.node, *before = c.start + 3ll * n.node;
         moved[0] += y[0] != before[0] || y[1] != before[1] || y[2] != before[2];
     });

@@ -51,20 +51,22 @@ class Async(UpdatePolicy):
         self.driver.engine.run(1)
 
     def pump(self) -> None:
-        """Makes an exchange with the workers and adapts the prefetch depth to the time of steps."""
-        with self.driver.source.round():
-            self._pump()
+        """Makes an exchange with the workers, takes up what came meanwhile, and requests matrices."""
+        source = self.driver.source
+        with source.round():
+            self._adapt()
+            self._exchange_copies()
+        with source.round():  # factors of many bodies need not wait for the records of the next round
+            self.driver.receive(source, self.on_factors)
+            if (begin := time.monotonic()) >= self._choice_due:
+                self._choose()  # of a thousand bodies it takes milliseconds: half of the time is kept for all else
+                self._choice_due = 2 * time.monotonic() - begin
 
-    def _pump(self) -> None:
-        driver = self.driver
+    def _adapt(self) -> None:
+        """Adapts the prefetch depth to the time of steps."""
+        driver, source, table = self.driver, self.driver.source, self.driver.table
         if self.prefetch.on_step(driver.engine.step, time.monotonic()) and not driver.counted:
-            source, table = driver.source, driver.table
             self.prefetch.update(table.mean(table.cost), len(table), source.worker_count(), source.queues_jobs())
-        self._exchange_copies()
-        if (begin := time.monotonic()) >= self._choice_due:
-            self._choose()  # of a thousand bodies it takes milliseconds: half of the time is kept for all else
-            end = time.monotonic()
-            self._choice_due = 2 * end - begin
 
     def exchange(self) -> None:
         """Takes up factors, sends the matrices that were copied, requests those of the most urgent bodies."""
