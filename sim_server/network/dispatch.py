@@ -311,13 +311,20 @@ class Dispatch(FactorSource):
     def _end_leases(self) -> None:
         """Ends the leases of jobs that took too long or were lost on the way."""
         if self.leases.over(self._clock(), self._intake.is_decoded):
-            self._intake.batches.finish()  # their answers may wait for a thread
+            self._finish_batches()  # their answers may wait for a thread
         for job in self.leases.expire(self._clock(), self._intake.is_decoded):
             self._counters.add("leases_over")
             self._on_expired(job, "was not answered within its lease")
         for job in self.leases.expire_undelivered(self._put_at, self._registry.idle_period):
             self._counters.add("jobs_lost")
             self._on_expired(job, f"was lost: worker {job.worker} says that it has no job")
+
+    def _finish_batches(self) -> None:
+        """Takes all messages of several factors that have come. Whatever they hold, the run goes on."""
+        try:
+            self._intake.batches.finish()
+        except Exception as error:
+            self._counters.refuse(self._counters.unexpected(error, "factors of messages"))
 
     def _put_at(self, job: InFlightJob) -> float:
         return float("inf") if self._intake.is_decoded(job) else job.put_at
@@ -358,7 +365,7 @@ class Dispatch(FactorSource):
     def _remove_worker(self, name: str) -> None:
         self._parting.pop(name, None)
         if self.leases.count(name):
-            self._intake.batches.finish()  # it may have answered before it left
+            self._finish_batches()  # it may have answered before it left
         self._sender.forget_link(name)
         self._counters.add("jobs_lost", self._book.remove_worker(name))
 

@@ -12,6 +12,7 @@ from test_batches import BEAMS, NAMES, Hand
 
 from protocol.shared_memory.limits import obstacle
 from sim_server.network import dispatch, link, worker_choice
+from sim_server.network.batch_intake import BatchIntake
 from tests.ports import free_endpoint
 
 pytestmark = [
@@ -79,6 +80,19 @@ def test_jobs_of_a_worker_that_leaves_without_an_answer_are_lost(monkeypatch: py
         played.driver.until(lambda: played.failed() == set(NAMES), "the end of its jobs")
         assert gone(played) and not played.made() and played.driver.link.slots_lent == 0
         assert played.driver.link.counters.jobs_lost == len(NAMES)
+
+
+def test_an_error_that_no_check_foresees_keeps_no_worker(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It is gone, its jobs are over, and the run goes on."""
+    monkeypatch.setattr(dispatch, "PARTING", 0.01)
+    monkeypatch.setattr(BatchIntake, "_matched", lambda *_: {}["nose"])
+    with staged() as played:
+        message = played.answer(played.batch())
+        message.jobs[1] = 10**9
+        played.send(message)
+        played.hand.token.undeclare()
+        played.driver.until(lambda: played.failed() == set(NAMES), "the end of its jobs")
+        assert played.driver.link.counters.refusals == {"unexpected": 1} and not played.driver.link.dispatch.decoding
 
 
 def test_jobs_of_a_worker_that_comes_back_at_once_are_lost(monkeypatch: pytest.MonkeyPatch) -> None:
