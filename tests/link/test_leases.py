@@ -52,7 +52,7 @@ def test_an_answer_frees_object_worker_and_slots(leases: Leases, allocator: Allo
     assert refused.value.kind == "duplicate"
 
 
-def test_nothing_holds_slots_of_a_job_that_is_over(leases: Leases) -> None:
+def test_nothing_holds_slots_of_a_job_that_is_over(leases: Leases, allocator: Allocator) -> None:
     """Those that were dropped meanwhile are free at once: the garbage collector comes by seldom."""
 
     class Memory:
@@ -64,7 +64,7 @@ def test_nothing_holds_slots_of_a_job_that_is_over(leases: Leases) -> None:
     gc.disable()
     try:
         leases.finish(started, 0.5)
-        leases._allocator.back.clear()  # type: ignore[union-attr]
+        allocator.back.clear()
         del started
         assert gone() is None
     finally:

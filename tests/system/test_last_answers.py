@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: MIT
 """Answers to several jobs that have come count, though no thread has taken them in yet when their jobs would end."""
 
+import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from threading import Event, Thread
+from types import SimpleNamespace
 
 import pytest
 from hand_worker import HandWorker
@@ -11,8 +12,8 @@ from link_helpers import Driver
 from test_batches import BEAMS, NAMES, Hand
 
 from protocol.shared_memory.limits import obstacle
-from sim_server.network import dispatch, link, worker_choice
-from sim_server.network.batch_intake import BatchIntake
+from sim_server.network import batch_intake, dispatch, link, worker_choice
+from sim_server.network.leases import Leases
 from tests.ports import free_endpoint
 
 pytestmark = [
@@ -24,7 +25,7 @@ pytestmark = [
 @pytest.fixture(autouse=True)
 def no_threads(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(worker_choice, "QUEUE_SECONDS", 60.0)
-    monkeypatch.setattr(link, "MESSAGE_THREADS", 0)  # each test has its own
+    monkeypatch.setattr(link, "MESSAGE_THREADS", 0)
 
 
 @contextmanager
@@ -52,17 +53,21 @@ def test_a_worker_that_leaves_has_answered_before_though_a_thread_has_its_answer
 ) -> None:
     """The thread has received it, and waits for Python's lock, while it is seen that the worker is gone."""
     monkeypatch.setattr(dispatch, "PARTING", 600.0)
-    go = Event()
+    monkeypatch.setattr(link, "MESSAGE_THREADS", 1)
+    go = threading.Event()
+
+    class Held:
+        """A lock that a thread of messages, which has received one, does not get before `go`."""
+
+        def __enter__(self) -> None:
+            assert threading.current_thread() is threading.main_thread() or go.wait(60)
+
+        def __exit__(self, *_: object) -> None:
+            pass
+
+    changed = {"Lock": Held, "Semaphore": threading.Semaphore, "get_ident": threading.get_ident}
+    monkeypatch.setattr(batch_intake, "threading", SimpleNamespace(**changed))
     with staged() as played:
-        batches = played.driver.link.dispatch._intake.batches
-
-        def run() -> None:
-            sample = batches._ring.recv()
-            go.wait(60)
-            batches._room.acquire()
-            batches._take_in(sample)
-
-        Thread(target=run, daemon=True).start()
         played.send(played.answer(played.batch()))
         played.hand.token.undeclare()
         played.driver.until(lambda: gone(played), "the end of the worker")
@@ -85,8 +90,8 @@ def test_jobs_of_a_worker_that_leaves_without_an_answer_are_lost(monkeypatch: py
 def test_an_error_that_no_check_foresees_keeps_no_worker(monkeypatch: pytest.MonkeyPatch) -> None:
     """It is gone, its jobs are over, and the run goes on."""
     monkeypatch.setattr(dispatch, "PARTING", 0.01)
-    monkeypatch.setattr(BatchIntake, "_matched", lambda *_: {}["nose"])
     with staged() as played:
+        monkeypatch.setattr(Leases, "match_answer", lambda *_: {}["nose"])
         message = played.answer(played.batch())
         message.jobs[1] = 10**9
         played.send(message)
