@@ -13,7 +13,7 @@ BODIES, ROUNDS = 7, 120
 
 
 class Asked:
-    """Asks for what each body has of its own: A = 100 k + body in step k (from 0), and x = 100 (k + 1) + body + 50 then.
+    """Asks for what each body has of its own: A = 100 k + body in step k (from 0), x = 100 (k + 1) + body + 50.
 
     asked: of each body, memory for what was asked for, and whether it is a matrix
     last: in memory of the loop, what came last of each, which the next copy leaves alone
