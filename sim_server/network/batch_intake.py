@@ -27,6 +27,7 @@ from sim_server.network.bookkeeping import Bookkeeping
 from sim_server.network.jobs_in_flight import InFlightJob
 from sim_server.updates.take_in import BeginCheck
 
+LOOK_PERIOD = 0.5  # s between looks at whether the session is closed, while no room for another message is made
 WAITING = 64  # messages that may wait to be taken in, beyond which the oldest is lost, and as many to be taken
 
 
@@ -57,7 +58,7 @@ class BatchIntake:
     """
 
     def __init__(self, session: zenoh.Session, server: str, counters: Counters, book: Bookkeeping, answers: Answers):
-        self._counters, self._book, self._answers = counters, book, answers
+        self._session, self._counters, self._book, self._answers = session, counters, book, answers
         self.together: list[FactorsTogether] = []
         self.wake: Callable[[], None] = lambda: None
         self.begin_check: BeginCheck = lambda *jobs: None
@@ -87,7 +88,7 @@ class BatchIntake:
         """Takes messages in until the session is closed. In as many threads as there are to be."""
         working = threading.Lock()
         self._working.append(working)
-        while self._room.acquire():
+        while self._has_room():
             try:
                 sample = self._ring.recv()
             except zenoh.ZError:  # the session was closed
@@ -95,6 +96,13 @@ class BatchIntake:
             with working:
                 self._take_in(sample)
             self.wake()
+
+    def _has_room(self) -> bool:
+        """Waits until one more message may be taken in; False once the session is closed."""
+        while not self._room.acquire(timeout=LOOK_PERIOD):
+            if self._session.is_closed():  # who sends jobs takes none any more
+                return False
+        return True
 
     def _take_in(self, sample: zenoh.Sample) -> None:
         """Takes a message in. Whatever it holds, the run goes on."""
@@ -157,7 +165,9 @@ class BatchIntake:
             for working in list(self._working):
                 held.enter_context(working)
             while (sample := self._ring.try_recv()) is not None:
-                self._room.acquire(blocking=False)
+                if not self._room.acquire(blocking=False):
+                    self.take(self.done)
+                    self._room.acquire(blocking=False)
                 self._take_in(sample)
         self.take(self.done)
 

@@ -7,6 +7,7 @@ factor_intake.py; all of them share what is known of workers and jobs (bookkeepi
 
 import logging
 import threading
+import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
@@ -43,6 +44,7 @@ log = logging.getLogger(__name__)
 TOKEN_QUERY_INTERVAL = 1.0  # s between queries for tokens of workers that send heartbeats without one
 MAX_NEW_PATTERNS = 256  # that wait to be prepared for; older ones are prepared for when their factors come
 LOOK_PERIOD = 1e-3  # s between looks at which leases are over
+PARTING = 0.05  # s for which jobs of a worker that left are kept: its last answers may be in the hands of a thread
 
 
 class Dispatch(FactorSource):
@@ -83,6 +85,7 @@ class Dispatch(FactorSource):
         self._inbox = Inbox(session, server)
         self._token_query_due = 0.0
         self._looked_at = -LOOK_PERIOD  # at which leases were looked through
+        self._parting: dict[str, float] = {}  # workers that left with jobs in flight: until when these are kept [s]
         self._received = False  # within a round whose messages were taken in
         self._known_rooms: dict[str, int] | None = None  # in such a round
         self._on_message: dict[str, Callable[[zenoh.Sample], None]] = {
@@ -297,6 +300,8 @@ class Dispatch(FactorSource):
             self._intake.take_decoded(batches)
         except Exception as error:
             self._counters.refuse(self._counters.unexpected(error, "factors taken in beside the caller"))
+        for name in [name for name, due in self._parting.items() if time.monotonic() >= due]:
+            self._remove_worker(name)
         self._sender.give_back_sent()
         self._query_tokens()
         if self._clock() >= self._looked_at + LOOK_PERIOD:  # many jobs are submitted one after another
@@ -305,12 +310,21 @@ class Dispatch(FactorSource):
 
     def _end_leases(self) -> None:
         """Ends the leases of jobs that took too long or were lost on the way."""
+        if self.leases.over(self._clock(), self._intake.is_decoded):
+            self._finish_batches()  # their answers may wait for a thread
         for job in self.leases.expire(self._clock(), self._intake.is_decoded):
             self._counters.add("leases_over")
             self._on_expired(job, "was not answered within its lease")
         for job in self.leases.expire_undelivered(self._put_at, self._registry.idle_period):
             self._counters.add("jobs_lost")
             self._on_expired(job, f"was lost: worker {job.worker} says that it has no job")
+
+    def _finish_batches(self) -> None:
+        """Takes all messages of several factors that have come. Whatever they hold, the run goes on."""
+        try:
+            self._intake.batches.finish()
+        except Exception as error:
+            self._counters.refuse(self._counters.unexpected(error, "factors of messages"))
 
     def _put_at(self, job: InFlightJob) -> float:
         return float("inf") if self._intake.is_decoded(job) else job.put_at
@@ -331,7 +345,10 @@ class Dispatch(FactorSource):
     def _on_token(self, sample: zenoh.Sample) -> None:
         name = name_in("alive_worker", sample.key_expr, "worker")
         if self._registry.set_token(name, sample.kind == zenoh.SampleKind.PUT):
-            self._remove_worker(name)
+            if self.leases.count(name):
+                self._parting[name] = time.monotonic() + PARTING
+            else:
+                self._remove_worker(name)
 
     def _on_heartbeat(self, sample: zenoh.Sample) -> None:
         data = take(sample.payload, CHANNELS["worker"].limit, "WorkerInfo")
@@ -346,8 +363,9 @@ class Dispatch(FactorSource):
                 self._counters.warn("worker_copies", f"worker {name} has no shared memory with us, arrays are copied")
 
     def _remove_worker(self, name: str) -> None:
+        self._parting.pop(name, None)
         if self.leases.count(name):
-            self._intake.batches.finish()  # it may have answered before it left
+            self._finish_batches()  # it may have answered before it left
         self._sender.forget_link(name)
         self._counters.add("jobs_lost", self._book.remove_worker(name))
 

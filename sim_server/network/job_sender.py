@@ -136,8 +136,8 @@ class JobSender:
         batch.slots = tuple(slot for slot in (matrix_slot, factor_slot) if slot is not None)
         batch.factor_slot, batch.factor_generation = factor_slot, factor_slot.generation if factor_slot else 0
         batch.payload_bytes = 0 if matrix_slot else job.values.nbytes
-        self._book.leases.start(batch)
         message = matrix_message(batch.jobs[0], known, self._sending.incarnation, lease, job.method)
+        self._book.leases.start(batch)
         payload = add_values(message, job.values, matrix_slot)
         name, attachment = (
             key("matrix", self._sending.server, worker=worker, object=job.object),
@@ -164,8 +164,8 @@ class JobSender:
         known, leases = self._book.decoder.objects[job.object], self._book.leases
         batch, lease = self._begin_alone(worker, job, known)
         batch.slots, batch.device_slot, batch.device_generation = (matrix, factor), factor, factor.generation
-        leases.start(batch)
         message = matrix_message(batch.jobs[0], known, self._sending.incarnation, lease, job.method)
+        leases.start(batch)
         message.device_matrix.CopyFrom(matrix.message())
         if self._sending.queue.post(partial(self._put_on_device, batch, job, message, matrix)):
             self._sending.on_sent(batch, job.values.nbytes)

@@ -32,7 +32,8 @@ class JobsInFlight:
     positions: the values are positions, from which the worker assembles the matrix
     part_bytes: of each part of a factor that travels in parts
     device_slot, device_generation: in place of factor_slot, of a device
-    jobs: a row for each
+    jobs: a row for each, until they are started: rows hold their batch, and what it holds is to be free as soon as the
+        last of them is over
     """
 
     worker: str

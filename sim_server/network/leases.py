@@ -54,6 +54,7 @@ class Leases:
         worker, deadlines = batch.worker, batch.deadlines
         self.by_object.update(zip(batch.objects, batch.jobs, strict=True))
         self.by_worker.setdefault(worker, {}).update(zip(batch.numbers, batch.jobs, strict=True))
+        batch.jobs = []
         self._next_deadline = min(self._next_deadline, float(deadlines.min()))
         self._next_exclusive = min(self._next_exclusive, float(batch.exclusive_until.min()))
         if self._deadlines is not None:
@@ -157,15 +158,21 @@ class Leases:
         if batch.worker in self._expired:
             self._free_expired(batch.worker, max(numbers))
 
-    def expire(self, now: float, is_answered: Callable[[InFlightJob], bool] = lambda job: False) -> list[InFlightJob]:
-        """Ends the leases that are over: objects and workers are free again, the slots are not. Returns the jobs.
+    def over(self, now: float, is_answered: Callable[[InFlightJob], bool] = lambda job: False) -> list[InFlightJob]:
+        """Returns the jobs whose leases `expire` would end.
 
         is_answered: the answer is there, and is taken in
         """
         if now <= self._next_deadline:
             return []
-        over = [job for job in self.jobs if now > job.deadline and not is_answered(job)]
-        expired = self._expire(over)
+        return [job for job in self.jobs if now > job.deadline and not is_answered(job)]
+
+    def expire(self, now: float, is_answered: Callable[[InFlightJob], bool] = lambda job: False) -> list[InFlightJob]:
+        """Ends the leases that are over: objects and workers are free again, the slots are not. Returns the jobs that
+        are of the present epoch of their objects. is_answered: as of `over`"""
+        if now <= self._next_deadline:
+            return []
+        expired = self._expire(self.over(now, is_answered))
         self._next_deadline = min((job.deadline for job in self.jobs), default=float("inf"))
         return expired
 

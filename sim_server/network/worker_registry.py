@@ -124,9 +124,9 @@ class WorkerRegistry:
         return len(self._tokens)
 
     def mark_seen(self, name: str, now: float) -> None:
-        """Notes any other message of a worker, which is a sign of life too."""
-        if name in self._workers:
-            self._workers[name].seen = now
+        """Notes any other message of a worker, which is a sign of life too; it may be told of later than others."""
+        if (worker := self._workers.get(name)) is not None:
+            worker.seen = max(worker.seen, now)
 
     def available(self, now: float, busy_until: Mapping[str, float]) -> list[str]:
         """Workers that may be given jobs: their token is there and they are not silent.

@@ -6,6 +6,7 @@ import queue
 import threading
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -63,9 +64,11 @@ class Stage:
         self.counters, self.leases = Counters(logging.getLogger("test")), Leases(None)
         registry, reliability = WorkerRegistry(7, 9.0), WorkerReliability()
         self.book = Bookkeeping(registry, self.leases, WorkerTiming(), reliability, self.decoder, time.monotonic)
-        session: Any = SimpleNamespace(declare_subscriber=lambda *_: self.ring)
+        self.closed = False
+        session: Any = SimpleNamespace(declare_subscriber=lambda *_: self.ring, is_closed=lambda: self.closed)
         self.intake = BatchIntake(session, "s", self.counters, self.book, Answers(self.counters, self.book))
-        threading.Thread(target=self.intake.run, daemon=True).start()
+        self.thread = threading.Thread(target=self.intake.run, daemon=True)
+        self.thread.start()
         self.leases.next_numbers(len(NAMES))
         self.leases.start(self.batch)
 
@@ -142,7 +145,7 @@ def test_each_answer_counts_once(stage):
 def test_what_is_no_answer_to_this_batch_costs_the_others_nothing(stage):
     """A failure, a job that does not exist, and one of another batch, which is in another slot."""
     other = batch_in_flight(range(50, 51), ["b"], 1, 5, "float32", "w", 9.0)
-    stage.leases.finish(stage.batch.jobs[1])
+    stage.leases.finish(stage.leases.by_object["b"])
     stage.leases.start(other)
     stage.message.jobs[1], stage.message.jobs[4] = 50, 1 << 40
     stage.message.failures.extend(["", "", "not positive definite", "", ""])
@@ -167,7 +170,7 @@ def test_an_error_that_no_check_foresees_costs_its_message_alone(stage, monkeypa
         stage.send()
     assert stage.take() == set() and stage.failed() == set(NAMES) and stage.leases.count("w") == 0
     assert stage.counters.refusals == {"unexpected": len(NAMES)} and len(stage.intake) == 0
-    stage.leases.start(stage.batch)
+    stage.leases.start(replace(stage.batch))
     stage.send()
     assert stage.take() == set(NAMES)
 
@@ -206,6 +209,34 @@ def test_what_waits_for_the_thread_is_taken_before_a_worker_is_forgotten(stage):
     stage.ring.put(stage.message)
     stage.intake.finish()
     assert stage.take() == set(NAMES) and stage.leases.count("w") == 0
+
+
+def test_what_is_taken_before_a_worker_is_forgotten_makes_no_room_for_more(stage):
+    """Also where as many wait as may: else the bound would grow with each worker that leaves."""
+    for _ in range(batch_intake.WAITING):
+        stage.send()
+    stage.ring.held = queue.SimpleQueue()
+    for _ in range(3):
+        stage.ring.put(stage.message)
+    stage.intake.finish()
+    stage.ring.held = None
+    assert stage.take() == set(NAMES) and stage.intake.done == 0
+    for _ in range(batch_intake.WAITING):
+        stage.send()
+    stage.ring.put(stage.message)
+    time.sleep(0.05)
+    assert stage.intake.done == batch_intake.WAITING and stage.ring.waiting.qsize() == 1
+
+
+def test_the_thread_ends_with_the_session_though_nobody_takes_messages_any_more(stage, monkeypatch):
+    monkeypatch.setattr(batch_intake, "LOOK_PERIOD", 0.01)
+    for _ in range(batch_intake.WAITING):
+        stage.send()
+    stage.thread.join(0.1)
+    assert stage.thread.is_alive()
+    stage.closed = True
+    stage.thread.join(60)
+    assert not stage.thread.is_alive()
 
 
 def test_until_a_message_is_taken_its_worker_has_done_its_jobs(stage, monkeypatch):

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: MIT
 """Leases of jobs in flight, without a network."""
 
+import gc
+import weakref
 from typing import Any
 
 import pytest
@@ -25,7 +27,7 @@ def sent(
 ) -> InFlightJob:
     (number,) = leases.next_numbers(1)
     slots = (f"slot {number}",)
-    started = in_flight(number, object, epoch, 1, "float32", worker, deadline, slots=slots, **others)
+    started = in_flight(number, object, epoch, 1, "float32", worker, deadline, **({"slots": slots} | others))
     leases.start(started.batch)
     return started
 
@@ -50,6 +52,25 @@ def test_an_answer_frees_object_worker_and_slots(leases: Leases, allocator: Allo
     assert refused.value.kind == "duplicate"
 
 
+def test_nothing_holds_slots_of_a_job_that_is_over(leases: Leases) -> None:
+    """Those that were dropped meanwhile are free at once: the garbage collector comes by seldom."""
+
+    class Memory:
+        pass
+
+    memory = Memory()
+    gone, started = weakref.ref(memory), sent(leases, slots=(memory,))
+    del memory
+    gc.disable()
+    try:
+        leases.finish(started, 0.5)
+        leases._allocator.back.clear()  # type: ignore[union-attr]
+        del started
+        assert gone() is None
+    finally:
+        gc.enable()
+
+
 def test_answers_of_a_message_free_what_each_would_alone(allocator: Allocator) -> None:
     """Jobs of one message share their slots, which are free once all are answered."""
 
@@ -60,8 +81,8 @@ def test_answers_of_a_message_free_what_each_would_alone(allocator: Allocator) -
         leases.expire(1.0)
         numbers, slots = leases.next_numbers(4), ("matrices", "factors")
         batch = batch_in_flight(numbers, list("abcd"), 1, 1, "float32", "w", 2.0, slots=slots)
-        leases.start(batch)
         jobs = batch.jobs
+        leases.start(batch)
         if together:
             leases.finish_all(jobs[:3], [0.1, 0.2, 0.3])
         else:

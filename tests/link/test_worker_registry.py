@@ -38,6 +38,8 @@ def test_silence_makes_unavailable_unless_the_worker_is_busy(registry: WorkerReg
     assert registry.available(3.5, {}) == ["w"]
     registry.mark_seen("w", 9.0)
     assert registry.available(10.0, {}) == ["w"]
+    registry.mark_seen("w", 7.0)  # told of late
+    assert registry.available(10.0, {}) == ["w"]
 
 
 def test_a_worker_leaves_by_its_token(registry: WorkerRegistry) -> None:
