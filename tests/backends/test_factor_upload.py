@@ -899,3 +899,15 @@ def test_who_settles_is_told_what_failed_beside(many, monkeypatch):
         go.set()
         with pytest.raises(ZeroDivisionError):
             upload.settle()
+
+
+@pytest.mark.parametrize(("most", "short", "limit"), [(3, 64, None), (3, 16, 8), (4, 64, 8)])
+def test_many_small_ones_have_the_whole_device_for_an_instant(many, monkeypatch, most, short, limit):
+    """Others would wait for them; what lasts longer, or is of few, keeps to what solves leave free. most: inverses
+    that count as many. short: bytes of their values at most"""
+    maker, upload, boxes = many
+    monkeypatch.setattr(inverse_builds, "MANY", most)
+    monkeypatch.setattr(inverse_builds, "SHORT", short)
+    post_all(upload, list(range(1, len(boxes) + 1)))  # three together, and one
+    maker.thread.submit(lambda: None).result()
+    assert maker.limits == [limit, 8]

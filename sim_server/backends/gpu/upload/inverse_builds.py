@@ -26,6 +26,8 @@ from sim_server.backends.gpu.upload.given_factor import GivenFactor
 log = logging.getLogger(__name__)
 
 BUSY = 0.25  # share of dt that steps in real time take, up to which builds may have the whole device
+MANY = 16  # inverses that are built together, from which on they may have it for an instant
+SHORT = 8 << 20  # bytes of the values of their factors, up to which that is some 100 us
 
 
 class Alike(NamedTuple):
@@ -217,7 +219,8 @@ class InverseBuilds:
         rows, own = list(storages), list(storages.values())
         given = alike.given if len(rows) == len(alike.given) else [alike.given[row] for row in rows]
         values = [each.values if each.source is None else each.source for each in given]
-        event = planned.builder.build_many(values, own, self._multiprocessors)
+        short = len(values) >= MANY and sum(each.nbytes for each in values) <= SHORT
+        event = planned.builder.build_many(values, own, None if short else self._multiprocessors)
         places = [place for place, row in enumerate(rows) if row in new] if new else []
         return BuiltInverses(alike.bodies[rows], given, alike.kind, planned, own, places, event)
 
@@ -240,7 +243,7 @@ class InverseBuilds:
     def _multiprocessors(self) -> int | None:
         """Multiprocessors that a build may keep busy: those that solves leave free; None: all, where steps in real time
         leave the device idle most of the time. A step then waits some 100 us now and then, and the build is done the
-        sooner."""
+        sooner. So do many small ones: on the others the next ones would wait for them, some ms each."""
         loop = self._loop.loop
         idle = loop.realtime and 0 < loop.step_seconds < BUSY * loop.dt
         return None if idle else self._solver.spared
