@@ -110,8 +110,8 @@ def test_factors_are_told_once_they_are_taken_and_their_jobs_are_over_then(stage
 def test_of_a_job_that_is_over_meanwhile_nothing_is_told(stage):
     stage.send()
     stage.leases.forget_object("b")  # it has a new epoch
-    stage.leases.by_object["d"] = batch_in_flight(range(99, 100), ["d"], 1, 7, "float32", "v", 9.0).jobs[0]
-    stage.leases._reassigned.add(stage.batch.numbers[3])  # another worker has it now
+    stage.leases.reassign(1.0, lambda job: job.object == "d")
+    stage.leases.start(batch_in_flight(range(99, 100), ["d"], 1, 7, "float32", "v", 9.0))  # another worker has it now
     assert stage.take() == {"a", "c", "e"} and stage.counters.refusals == {"epoch": 1}
     assert stage.leases.count("w") == 0 and stage.failed() == set()
 
@@ -184,7 +184,7 @@ def test_an_error_while_a_message_is_taken_ends_its_jobs(stage, monkeypatch):
 
 def test_jobs_of_a_message_that_fails_as_it_is_taken_are_not_taken_in_any_more(stage, monkeypatch):
     """Else their leases would never be over, and their objects never have a factor again."""
-    monkeypatch.setattr(BatchIntake, "_matched", lambda *_: {}["nose"])
+    monkeypatch.setattr(Leases, "match_answer", lambda *_: {}["nose"])
     stage.message.jobs[2] = 1 << 40
     stage.send()
     with pytest.raises(KeyError):
