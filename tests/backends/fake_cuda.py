@@ -225,7 +225,7 @@ class FakeScene:
         if stamp:
             self._stamp()
         for _ in range(steps):
-            self._step()
+            self.make_step()
 
     def _elastic(self) -> None:
         self.energies[(self.done - 1) % CAPACITY]["elastic"] = 1000 + self.done
@@ -234,7 +234,7 @@ class FakeScene:
         self.time += 1_000_000  # the device had nothing to do for a while
         self.stamps[self.done % CAPACITY]["begin"] = self.time
 
-    def _step(self) -> None:
+    def make_step(self) -> None:
         k, slot = self.done, self.done % CAPACITY
         self.seen.append(int(self.argument[0]))
         self.values[:] = k

@@ -22,7 +22,7 @@ class Asked:
     def __init__(self, seed: int, real: str):
         self.random, self.scene = random.Random(seed), FakeScene(bodies=BODIES, real=real)
         self.scene.device.pieces = self.random.choice((1, 3, 10))  # of work between two looks
-        loop, step = self.scene.loop, self.scene._step
+        loop, step = self.scene.loop, self.scene.make_step
         loop.loop.exchange_seconds, loop.loop.batch_seconds = self.random.choice(((1e-12, 1e-12), (5e-4, 2e-3)))
         self.loop, own = loop, np.repeat(np.arange(BODIES), 2)
 
@@ -31,7 +31,7 @@ class Asked:
             self.scene.values[:] = 100 * (self.scene.done - 1) + own[:, None, None]
             self.scene.x[:] = 100 * self.scene.done + own[:, None] + 50
 
-        self.scene._step = told  # type: ignore[method-assign]
+        self.scene.make_step = told  # type: ignore[method-assign]
         self.asked: dict[int, tuple[np.ndarray, bool]] = {}
         self.last: dict[int, tuple[np.ndarray, int]] = {}
         self.came = 0

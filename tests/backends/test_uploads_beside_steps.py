@@ -32,7 +32,7 @@ class Beside(Uploads):
         self.wrong: list[int] = []
         self.failed: list[BaseException] = []
         self.ended = threading.Event()
-        storages, build, step = dict[int, list[int]](), self.maker.build_many, self.scene._step
+        storages, build, step = dict[int, list[int]](), self.maker.build_many, self.scene.make_step
 
         def noted(values: list[np.ndarray], own: list[list[int]], limit: int | None) -> Any:
             event = build(values, own, limit)
@@ -47,7 +47,7 @@ class Beside(Uploads):
                     self.used[body].append(number)
             step()
 
-        self.maker.build_many, self.scene._step = noted, looked_at
+        self.maker.build_many, self.scene.make_step = noted, looked_at
         self.scene.loop.run(1)  # what it takes is compiled
         self.scene.device.set("event_query", self.looked)
         loop = self.scene.loop.loop
