@@ -27,7 +27,7 @@ log = logging.getLogger(__name__)
 
 BUSY = 0.25  # share of dt that steps in real time take, up to which builds may have the whole device
 MANY = 16  # inverses that are built together, from which on they may have it for an instant
-SHORT = 8 << 20  # bytes of the values of their factors, up to which that is some 100 us
+SHORT = 16 << 20  # bytes of the values of their factors, up to which that is some 200 us
 
 
 class Alike(NamedTuple):
