@@ -5,6 +5,7 @@ import math
 import os
 import threading
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any
 
@@ -123,13 +124,12 @@ class Hand:
             assert np.allclose(product(factor), expected, atol=1e-5) and factor.step == self.step
 
 
-@pytest.fixture(scope="module")
-def stage() -> Iterator[Hand]:
-    patch = pytest.MonkeyPatch()
-    patch.setattr(worker_choice, "QUEUE_SECONDS", 60.0)
-    endpoint = free_endpoint()
+@contextmanager
+def staged(clock: Callable[[], float] | None = None) -> Iterator[Hand]:
+    """A server and a worker by hand, who has made a factor of each object. clock: of the server; None: its own"""
+    endpoint, options = free_endpoint(), {} if clock is None else {"clock": clock}
     with (
-        ServerLink(listen=[endpoint], silence=600) as link,
+        ServerLink(listen=[endpoint], silence=600, **options) as link,
         HandWorker(endpoint, link.incarnation, shared_memory=True) as hand,
     ):
         played = Hand(Driver(link), hand)
@@ -138,6 +138,14 @@ def stage() -> Iterator[Hand]:
         played.hello()
         played.driver.until(link.dispatch.ready, "the worker")
         played.first_factors()
+        yield played
+
+
+@pytest.fixture(scope="module")
+def stage() -> Iterator[Hand]:
+    patch = pytest.MonkeyPatch()
+    patch.setattr(worker_choice, "QUEUE_SECONDS", 60.0)
+    with staged() as played:
         yield played
     patch.undo()
 

@@ -2,19 +2,14 @@
 """Answers to several jobs that have come count, though no thread has taken them in yet when their jobs would end."""
 
 import threading
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from types import SimpleNamespace
 
 import pytest
-from hand_worker import HandWorker
-from link_helpers import Driver
-from test_batches import BEAMS, NAMES, Hand
+from test_batches import NAMES, Hand, staged
 
 from protocol.shared_memory.limits import obstacle
 from sim_server.network import batch_intake, dispatch, link, worker_choice
 from sim_server.network.leases import Leases
-from tests.ports import free_endpoint
 
 pytestmark = [
     pytest.mark.system,
@@ -26,22 +21,6 @@ pytestmark = [
 def no_threads(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(worker_choice, "QUEUE_SECONDS", 60.0)
     monkeypatch.setattr(link, "MESSAGE_THREADS", 0)
-
-
-@contextmanager
-def staged(clock: Callable[[], float] | None = None) -> Iterator[Hand]:
-    endpoint, options = free_endpoint(), {} if clock is None else {"clock": clock}
-    with (
-        link.ServerLink(listen=[endpoint], silence=600, **options) as server,
-        HandWorker(endpoint, server.incarnation, shared_memory=True) as hand,
-    ):
-        played = Hand(Driver(server), hand)
-        for beam in BEAMS.values():
-            server.announce(beam)
-        played.hello()
-        played.driver.until(server.dispatch.ready, "the worker")
-        played.first_factors()
-        yield played
 
 
 def gone(played: Hand) -> bool:
