@@ -73,22 +73,20 @@ class BatchSender:
 
     def _send(self, worker: str, jobs: JobsTogether, told: BatchLayout) -> list[bool]:
         """Sends jobs to a worker in one message, or one by one if there are no slots for them together."""
-        sending, leases = self._sending, self._sending.book.leases
+        sending, terms = self._sending, self._sending.book.leases.terms
         slots = self._allocate(told) if len(jobs) > 1 else None
         if slots is None:
             return [self._send_alone(worker, job) for job in jobs]
-        seconds, periods = leases.terms.of_all(jobs.objects, told.blocks, worker, jobs.method.name)
+        seconds, periods = terms.of_all(jobs.objects, told.blocks, worker, jobs.method.name)
         batch = sending.begin(worker, jobs, seconds, periods)
         batch.first, batch.rooms, batch.bodies = told.first, told.rooms, jobs.bodies
         batch.matrices, batch.matrices_at = jobs.values, jobs.at
         batch.slots, batch.factor_slot, batch.factor_generation = slots, slots[1], slots[1].generation
-        leases.start(batch)
         message = partial(batch_message, batch, told, seconds.tolist(), jobs.method, sending.incarnation, *slots)
-        if sending.queue.post(partial(self._fill_and_put, message, batch, filling := Filling(slots))):
+        send = partial(self._fill_and_put, message, batch, filling := Filling(slots))
+        if sending.post(batch, 72 * sum(told.blocks), send):
             self._filling.append(filling)
-            sending.on_sent(batch, 72 * sum(told.blocks))
             return [True] * len(jobs)
-        leases.cancel(batch)
         self._give_back(slots)
         return [False] * len(jobs)
 

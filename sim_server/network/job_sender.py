@@ -137,19 +137,11 @@ class JobSender:
         batch.factor_slot, batch.factor_generation = factor_slot, factor_slot.generation if factor_slot else 0
         batch.payload_bytes = 0 if matrix_slot else job.values.nbytes
         message = matrix_message(batch.jobs[0], known, self._sending.incarnation, lease, job.method)
-        self._book.leases.start(batch)
         payload = add_values(message, job.values, matrix_slot)
-        name, attachment = (
-            key("matrix", self._sending.server, worker=worker, object=job.object),
-            message.SerializeToString(),
-        )
-        if self._sending.queue.post(
-            lambda: self._sending.put(batch, name, payload, attachment, matrix_slot is not None)
-        ):
-            self._sending.on_sent(batch, job.values.nbytes)
-            return True
-        self._book.leases.cancel(batch)
-        return False
+        name = key("matrix", self._sending.server, worker=worker, object=job.object)
+        attachment, shared = message.SerializeToString(), matrix_slot is not None
+        send = partial(self._sending.put, batch, name, payload, attachment, shared)
+        return self._sending.post(batch, job.values.nbytes, send)
 
     def _lend_on_device(self, worker: str, job: Job) -> list[DeviceSlot] | None:
         """Lends slots of device memory for a matrix and its factor, whose size must be known; None: they travel through
@@ -161,17 +153,13 @@ class JobSender:
         return self.device.lend([job.values.nbytes, size])
 
     def _send_on_device(self, worker: str, job: Job, matrix: DeviceSlot, factor: DeviceSlot) -> bool:
-        known, leases = self._book.decoder.objects[job.object], self._book.leases
+        known = self._book.decoder.objects[job.object]
         batch, lease = self._begin_alone(worker, job, known)
         batch.slots, batch.device_slot, batch.device_generation = (matrix, factor), factor, factor.generation
         message = matrix_message(batch.jobs[0], known, self._sending.incarnation, lease, job.method)
-        leases.start(batch)
         message.device_matrix.CopyFrom(matrix.message())
-        if self._sending.queue.post(partial(self._put_on_device, batch, job, message, matrix)):
-            self._sending.on_sent(batch, job.values.nbytes)
-            return True
-        leases.cancel(batch)
-        return False
+        send = partial(self._put_on_device, batch, job, message, matrix)
+        return self._sending.post(batch, job.values.nbytes, send)
 
     def _put_on_device(self, batch: JobsInFlight, job: Job, message: Matrix, matrix: DeviceSlot) -> None:
         """Copies a matrix within the device and sends its job, in the thread of the queue."""

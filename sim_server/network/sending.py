@@ -2,6 +2,7 @@
 """What all messages with jobs have in common: leases begin, the network takes them in the thread of the send queue."""
 
 import time
+from collections.abc import Callable
 from functools import cache
 
 import numpy as np
@@ -25,7 +26,7 @@ class Sending:
         self, session: zenoh.Session, server: str, incarnation: int, queue: SendQueue, counters: Counters,
         book: Bookkeeping,
     ):  # fmt: skip
-        self._session, self.server, self.incarnation, self.queue = session, server, incarnation, queue
+        self._session, self.server, self.incarnation, self._queue = session, server, incarnation, queue
         self.counters, self.book = counters, book
         self._fast_links: set[str] = set()  # workers without shared memory whose link takes a job at once
 
@@ -46,12 +47,20 @@ class Sending:
             jobs.epochs, jobs.steps, jobs.warps, deadlines, now + periods, now,
         )  # fmt: skip
 
-    def on_sent(self, batch: JobsInFlight, size: int) -> None:
-        """Takes note of a batch whose matrices have so many bytes."""
+    def post(self, batch: JobsInFlight, size: int, send: Callable[[], None]) -> bool:
+        """Begins the leases of a batch and has the thread of the queue send it; False, and no lease, if that is full.
+
+        size: bytes of its matrices. send: ends with `put`
+        """
+        self.book.leases.start(batch)
+        if not self._queue.post(send):
+            self.book.leases.cancel(batch)
+            return False
         self.book.last_worker.update(dict.fromkeys(batch.objects, batch.worker))
         self.book.reliability.on_sent(batch.worker, self.book.clock())
         self.counters.add("jobs", len(batch))
         self.counters.add("bytes_out", size)
+        return True
 
     def put(self, batch: JobsInFlight, name: str, payload: zenoh.ZBytes, attachment: bytes, shared: bool) -> None:
         """Sends a job or a batch of them, in the thread of the send queue. If a link is full, zenoh drops it or blocks.

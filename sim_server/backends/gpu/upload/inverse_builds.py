@@ -219,6 +219,7 @@ class InverseBuilds:
         rows, own = list(storages), list(storages.values())
         given = alike.given if len(rows) == len(alike.given) else [alike.given[row] for row in rows]
         values = [each.values if each.source is None else each.source for each in given]
+        # On few multiprocessors many small ones take some ms, and the next ones wait for them
         short = len(values) >= MANY and sum(each.nbytes for each in values) <= SHORT
         event = planned.builder.build_many(values, own, None if short else self._multiprocessors)
         places = [place for place, row in enumerate(rows) if row in new] if new else []
@@ -243,7 +244,7 @@ class InverseBuilds:
     def _multiprocessors(self) -> int | None:
         """Multiprocessors that a build may keep busy: those that solves leave free; None: all, where steps in real time
         leave the device idle most of the time. A step then waits some 100 us now and then, and the build is done the
-        sooner. So do many small ones: on the others the next ones would wait for them, some ms each."""
+        sooner."""
         loop = self._loop.loop
         idle = loop.realtime and 0 < loop.step_seconds < BUSY * loop.dt
         return None if idle else self._solver.spared
